@@ -1,17 +1,17 @@
-// The hook for programs: `window.vfr`, which is there at the page's load event.
+// The interface for programs: `window.vfr`, which is there at the page's load event.
 //
 //     await vfr.ready;  vfr.info;  await vfr.render({ c2w, fx, fy, cx, cy, width, height, quality, background })
 
 const SIZES = ["fx", "fy", "cx", "cy", "width", "height"];
 const QUALITIES = ["exact", "high", "fast"];
 
-// Installs it; `renderer` is a promise of the Renderer that shows the whole scene.
+// Install `window.vfr`; `renderer` is a promise of the Renderer that shows the whole scene.
 export function installApi(renderer) {
   let found = null;
   const ready = renderer.then((made) => {
     found = made;
   });
-  ready.catch(() => {}); // told by whoever waits for it, and by the page
+  ready.catch(() => {}); // reported by whoever awaits it, and by the page
   globalThis.vfr = {
     ready,
     get info() {
@@ -24,7 +24,7 @@ export function installApi(renderer) {
   };
 }
 
-// The view, or a TypeError that names what is wrong with it.
+// Return the view with its quality, "exact" by default. Throws a TypeError that names what is wrong with the view.
 function checked(view) {
   const wrong = (what, expected, got) => new TypeError(`vfr.render: ${what}: expected ${expected}, got ${JSON.stringify(got)}`);
   const numbers = (some, n) => some?.length === n && [...some].every(Number.isFinite);

@@ -1,7 +1,8 @@
-// Begins the page in one file: unpacks the viewer's script, which the page has as zlib's bytes in text, and runs it. The
-// page's policy names that script by its checksum.
+// Starts a page that is one file: unpacks the viewer's script, which the page holds as text, compressed by zlib, and runs
+// it. The page's content security policy names that script by its checksum.
 //
-// Programs find `vfr` at the page's load event, when that script may not run yet: what they ask of it waits.
+// Programs find `vfr` at the page's load event, when that script may not have run yet. So `early` takes its place until
+// then, and what programs ask of `early` waits.
 
 import { bytesOf } from "./text_bytes.js";
 
@@ -21,7 +22,7 @@ async function begin() {
   script.id = "script";
   script.textContent = await unpacked(document.getElementById("viewer"));
   document.body.append(script);
-  if (window.vfr === early) throw new Error(CHANGED); // the policy lets no other script run
+  if (window.vfr === early) throw new Error(CHANGED); // it did not run: the policy allows no changed script
   Object.defineProperties(early, Object.getOwnPropertyDescriptors(window.vfr));
   return window.vfr.ready;
 }
@@ -31,7 +32,7 @@ window.vfr = early;
 early.ready = begin();
 early.ready.catch(({ message }) => {
   const status = document.getElementById("status");
-  if (status.textContent) return; // the viewer has said it
+  if (status.textContent) return; // the viewer has reported it already
   document.body.classList.add("failed");
   status.textContent = `This scene cannot be shown here: ${message}. Open this page in a current Chrome, Edge, Firefox or Safari.`;
 });

@@ -1,5 +1,5 @@
-// A ray through a box: where it enters, and the lattice of samples on it. The twin of player/march/box.py, which has the
-// letters. A place on the ray is s, the distance behind the entry.
+// A ray through a box: where the ray enters, and the lattice of samples on it. The twin of player/march/box.py. A position on
+// the ray is given by s, the distance from the entry in model units.
 
 uniform vec3 uAabbMin, uCellsPerUnit;
 uniform float uStep, uMostLength;
@@ -7,8 +7,8 @@ uniform int uResolution;
 
 const float SKIP_MARGIN = 0.01;
 
-vec3 rayPoint, rayDirection, rayInverse, rayAhead; // 1 / direction, and 1 along the axes where it is positive
-vec3 rayNever; // large along the axes that the ray does not move on
+vec3 rayPoint, rayDirection, rayInverse, rayAhead; // rayInverse: 1 / direction; rayAhead: 1 where direction is positive, else 0
+vec3 rayNever; // large along the axes on which the ray does not move, else 0
 float rayT, rayLength;
 float sampleS;
 
@@ -31,18 +31,19 @@ void enter(vec3 origin, vec3 direction) {
   rayLength = min(tOut - tIn, uMostLength);
 }
 
-// Grid coordinates of the middle of `size` base steps from n on, and in sampleS where that is on the ray.
+// Return the grid coordinates of the middle of `size` base steps from n on, and set sampleS to its position on the ray.
 vec3 placeOf(int n, int size) {
   sampleS = (float(n) + float(size) * 0.5) * uStep;
   return rayPoint + sampleS * rayDirection;
 }
 
-// Model units that the sample of the last placeOf stands for.
+// Return the length of ray, in model units, that the sample of the last placeOf stands for.
 float wayOf(int size) {
   return float(size) * uStep;
 }
 
-// The next base step to look at, after step n, whose middle is at g in a brick around which all within `reach` are empty.
+// Return the next base step to look at after step n, whose middle is at g in `brick`. All bricks up to a distance of `reach`
+// from that brick are empty.
 int jumpFrom(int n, vec3 g, vec3 brick, float reach) {
   vec3 end = (brick - reach + rayAhead * (2.0 * reach + 1.0)) * 8.0 + SKIP_MARGIN * (1.0 - 2.0 * rayAhead);
   vec3 way = (end - rayPoint) * rayInverse * vec3(equal(rayNever, vec3(0))) + rayNever;
@@ -58,7 +59,8 @@ float distanceAt(float s) {
   return rayT + s;
 }
 
-// A gradient along the grid's axes, codes a model unit, at the sample of the last placeOf, in the model frame.
+// Return, in the model frame, a gradient at the sample of the last placeOf. It is given along the grid's axes, in codes per
+// model unit.
 vec3 pulledBack(vec3 gradient) {
   return gradient;
 }

@@ -1,7 +1,7 @@
-// Bricks of one level, each with a mask of 512 bits, and how to find them. The twin of Bricks and Vertices in
-// player/asset/pyramid.py.
+// The bricks of one level, each with a mask of 512 bits, and a hash table that finds them by their coordinates. The twin
+// of Bricks and Vertices in player/asset/pyramid.py.
 
-// A coordinate of three components from 0 to 511 as one integer, which rises with (x, y, z).
+// Pack a coordinate, three components from 0 to 511, into one integer. Integers are in the order of (x, y, z).
 export const keyOf = (x, y, z) => (x << 18) | (y << 9) | z;
 export const coordOf = (key) => [key >> 18, (key >> 9) & 511, key & 511];
 
@@ -17,7 +17,7 @@ export class Bricks {
   constructor(keys, masks) {
     this.keys = keys;
     this.masks = masks;
-    this.bytes = new Uint8Array(masks.buffer, masks.byteOffset, 4 * masks.length); // 8 x + y of a brick: its bits along z
+    this.bytes = new Uint8Array(masks.buffer, masks.byteOffset, 4 * masks.length); // byte 8 x + y of a brick: its bits along z
     this.n = keys.length;
     const size = 1 << Math.max(2, 32 - Math.clz32(2 * this.n));
     this.slots = new Int32Array(size).fill(-1);
@@ -28,7 +28,7 @@ export class Bricks {
     }
   }
 
-  // Which brick has the coordinate, -1 if none.
+  // Return the index of the brick at a coordinate, -1 if there is none.
   find(x, y, z) {
     if ((x | y | z) < 0) return -1;
     const key = keyOf(x, y, z);
@@ -39,7 +39,7 @@ export class Bricks {
     }
   }
 
-  // Those whose masks are not all 0.
+  // Return the bricks whose masks are not all 0.
   withoutEmpty() {
     const kept = [];
     for (let i = 0; i < this.n; i++) {
@@ -61,12 +61,12 @@ function hash(key) {
   return mixed ^ (mixed >>> 15);
 }
 
-// Numbers of vertices in the order of bricks and then of bits.
+// The numbers of the vertices of bricks, counted by brick and then by bit.
 export class Ranks {
   constructor(bricks, masks) {
     this.bricks = bricks;
     this.masks = masks;
-    this.first = new Int32Array(masks.length); // of each word
+    this.first = new Int32Array(masks.length); // number of the first vertex of each word
     let n = 0;
     for (let word = 0; word < masks.length; word++) {
       this.first[word] = n;
@@ -75,7 +75,7 @@ export class Ranks {
     this.n = n;
   }
 
-  // The number of bit b of a brick; `none` if the bit is not set, or the brick is -1.
+  // Return the number of bit b of a brick; `none` if the bit is not set, or the brick is -1.
   at(brick, b, none) {
     if (brick < 0) return none;
     const word = 16 * brick + (b >> 5);

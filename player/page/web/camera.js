@@ -1,21 +1,21 @@
-// From a view, a camera in the world's frame, to the rays of its pixels in the model frame.
+// Computes the rays of a view's pixels in the model frame; a view's camera is in the world frame.
 //
-// The ray through pixel (x, y) goes along centre + (x - px) across + (y - py) down, where `centre` has length 1 and
-// belongs to the pixel (px, py). That pixel is the one that the box's middle is in, if the camera is far away, and rays
-// begin beside the box then: what is left of float32 is what lies between the pixels of the box.
+// The ray through pixel (x, y) goes along centre + (x - px) across + (y - py) down, where `centre` has length 1 and is the
+// direction of the ray through (px, py). If the camera is far away, (px, py) is where the middle of the box is seen, and
+// rays begin beside the box: so float32 still resolves the differences between the pixels of the box.
 
-const FAR_AWAY = 64; // half diagonals of the box
+const FAR_AWAY = 64; // distance beyond which a camera is far away, in half diagonals of the box
 
 const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 const sum = (a, s, b) => [a[0] + s * b[0], a[1] + s * b[1], a[2] + s * b[2]];
 
-// { rotation [9], row-major, scale, move [3] } of a similarity [4][4]: x -> scale rotation x + move.
+// Take a similarity [4][4] apart, x -> scale rotation x + move: { rotation [3][3], scale, move [3] }.
 function similarity(matrix) {
   const scale = Math.hypot(matrix[0][0], matrix[0][1], matrix[0][2]);
   return { scale, rotation: matrix.slice(0, 3).map((row) => row.slice(0, 3).map((x) => x / scale)), move: matrix.slice(0, 3).map((row) => row[3]) };
 }
 
-// What the shaders' uniforms of the same names are to be.
+// Return the values of the uniforms in rays.glsl and pixel.glsl that depend on the view's camera, by name.
 export function raysOf(view, manifest) {
   const { scale, rotation, move } = similarity(manifest.world_from_model);
   const turn = (v) => [0, 1, 2].map((i) => rotation[0][i] * v[0] + rotation[1][i] * v[1] + rotation[2][i] * v[2]);

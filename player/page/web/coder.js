@@ -1,7 +1,7 @@
-// Decodes sections of small integers: interleaved rANS with contexts (docs/format.md, "Coder"). The twin of
-// player/asset/coder, with its names.
+// Decodes blocks of small integers by interleaved rANS with contexts (docs/format.md, "Coder"). The twin of
+// player/asset/coder, which uses the same names.
 
-const END = 63; // the largest magnitude that has a place of its own in a table
+const END = 63; // the largest magnitude in a table; one further byte is added to symbols coded as -63 or 63
 const N_SYMBOLS = 2 * END + 1;
 const BITS = 12;
 const TOTAL = 1 << BITS;
@@ -14,13 +14,13 @@ const HALF = 64;
 const SUM_STEPS = [1, 2, 3, 5, 8, 12, 18, 30];
 const LEAN_STEPS = [1, 2, 4, 8];
 
-// Magnitude and sign of clipped symbols in one integer, 128 |s| + s, by the symbol + 63.
+// For each symbol + 63: the symbol s, clipped to -15 ... 15, as 128 |s| + s, so that one sum adds magnitudes and symbols.
 const MIXED = Int16Array.from({ length: N_SYMBOLS }, (_, i) => {
   const near = Math.max(-NEAR, Math.min(NEAR, i - END));
   return 128 * Math.abs(near) + near;
 });
 
-// The context by the sum of the three neighbours' MIXED and 64.
+// The context, without its class, for each sum of the MIXED of the three neighbours, plus HALF.
 const CONTEXT_OF_SUM = Uint8Array.from({ length: (3 * NEAR + 1) << 7 }, (_, i) => {
   const total = i >> 7;
   const lean = i - HALF - (total << 7);
@@ -29,7 +29,7 @@ const CONTEXT_OF_SUM = Uint8Array.from({ length: (3 * NEAR + 1) << 7 }, (_, i) =
   return rise * (2 * LEAN_STEPS.length + 1) + side + LEAN_STEPS.length;
 });
 
-// What a zlib stream holds, at most `most` bytes; null if it is none, or holds more.
+// Unpack a zlib stream to at most `most` bytes; null if the stream is broken or holds more.
 async function inflated(bytes, most) {
   const found = new Uint8Array(most);
   const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("deflate"));
@@ -51,8 +51,9 @@ async function inflated(bytes, most) {
   }
 }
 
-// A section's tables: symbols [n_tables * 4096], the symbol + 63 at each place; entries [n_tables * 128], for each
-// symbol + 63 its count, times 4096, and where its places begin; ofContext, the table of each context.
+// Unpack the tables of a block: { symbols, entries, ofContext, hasEnds }. `symbols` [n_tables * 4096] has the symbol + 63 at
+// each place; `entries` [n_tables * 128], for each symbol + 63, its count times 4096 plus its first place; `ofContext`
+// [nNamed] the table of each context. `hasEnds`: whether a symbol can be -63 or 63.
 async function unpackTables(bytes, nNamed, where) {
   const content = await inflated(bytes, nNamed + 1 + MAX_TABLES * (2 + 2 * N_SYMBOLS));
   if (!content || content.length <= nNamed) throw new Error(`${where}: tables: expected one whole zlib stream`);
@@ -89,14 +90,14 @@ async function unpackTables(bytes, nNamed, where) {
   return { symbols, entries, ofContext, hasEnds };
 }
 
-// Decodes a section channel by channel.
+// A decoder of a block, which is read channel by channel.
 export class Decoder {
-  // - bytes: a section's bytes;
-  // - neighbours: [alongZ, alongY, alongX], each Int32Array [n]: the rows beside each row, n for one that is not there;
-  // - nChannels, nClasses: as it was encoded;
-  // - where: the section's name in messages.
-  // Rejects with an Error if it is not a block of so many rows and channels. Memory is bounded by the rows, by the
-  // length of `bytes`, and by 2 MB.
+  // - bytes: the bytes of the block;
+  // - neighbours: [alongZ, alongY, alongX], each Int32Array [n]: the row one step before each row on that axis, n if none;
+  // - nChannels, nClasses: the numbers of channels and of classes with which the block was encoded;
+  // - where: the section's name in error messages.
+  // Rejects with an Error if `bytes` are not a block of so many rows and channels. Memory is bounded by the number of
+  // rows, by the length of `bytes`, and by 2 MB.
   static async open(bytes, neighbours, nChannels, nClasses, where) {
     const n = neighbours[0].length;
     const decoder = new Decoder();
@@ -130,12 +131,12 @@ export class Decoder {
     }
     decoder.beyondTaken = 0;
     decoder.beside = inOrder(neighbours, nLanes);
-    decoder.symbols = new Uint8Array(n + 1).fill(SYMBOL_OF_ZERO); // of the last channel + 63, and 0 for what is not there
+    decoder.symbols = new Uint8Array(n + 1).fill(SYMBOL_OF_ZERO); // of the last channel, + 63; the last stands for no row
     return decoder;
   }
 
-  // Decodes the next channel into `found` Uint8Array [n], the symbols + 63, for `classes` Uint8Array [n]; returns how
-  // many of `beyond` are those of earlier channels. Throws an Error.
+  // Decode the next channel, whose `classes` Uint8Array [n] are given, into `found` Uint8Array [n], as symbols + 63. Returns
+  // how many bytes of `beyond` belong to earlier channels. Throws an Error if the block is damaged.
   channel(classes, found) {
     if (this.isEmpty) return 0;
     const { n, tables, states, words, beside, symbols } = this;
@@ -159,7 +160,8 @@ export class Decoder {
     return before;
   }
 
-  // Throws an Error unless all is read that there is, and every state is what encoding began with.
+  // Throw an Error unless all channels, all words and all bytes of `beyond` have been read, and every state is 2^16, with
+  // which encoding began.
   finish() {
     if (this.isEmpty) return;
     if (this.channelsDone !== this.nChannels || this.wordsTaken !== this.nWords) {
@@ -172,8 +174,8 @@ export class Decoder {
   }
 }
 
-// Where the neighbours' symbols are that each row is decoded with, three a row, in the order of decoding; n for those that
-// are not decoded at an earlier step.
+// Return Int32Array [3 n]: the three neighbours of each row, with the rows in the order of decoding. A neighbour that is
+// not decoded at an earlier step is replaced by n.
 function inOrder([alongZ, alongY, alongX], nLanes) {
   const n = alongZ.length;
   const nSteps = Math.floor(n / nLanes);
@@ -188,7 +190,7 @@ function inOrder([alongZ, alongY, alongX], nLanes) {
       const step = row - first;
       steps[row] = step;
       const z = alongZ[row], y = alongY[row], x = alongX[row];
-      beside[to] = z >= first || steps[z] < step ? z : n; // neighbours come before their row
+      beside[to] = z >= first || steps[z] < step ? z : n; // in a lane, neighbours come before their row
       beside[to + 1] = y >= first || steps[y] < step ? y : n;
       beside[to + 2] = x >= first || steps[x] < step ? x : n;
     }
@@ -196,8 +198,8 @@ function inOrder([alongZ, alongY, alongX], nLanes) {
   return beside;
 }
 
-// The symbols + 63 of a channel into `found` [n + 1], whose last stays what it is; returns how many words are taken then,
-// -1 if there are too few.
+// Decode the symbols + 63 of a channel into `found` [n + 1], whose last element stays as it is. Returns how many words
+// have been taken by then, or -1 if there are too few.
 function decodeChannel(words, at, states, symbolOf, entries, ofContext, classes, beside, found) {
   const n = classes.length;
   const nLanes = states.length;

@@ -1,7 +1,7 @@
-// Colours of a tile, over the background.
+// Draws the colours of a tile over the background.
 
 uniform highp usampler2D uColours, uOpacity;
-uniform vec4 uBackground; // alpha 0 where it is transparent
+uniform vec4 uBackground; // alpha 0 if the background is transparent
 uniform vec2 uTile;
 uniform bool uPremultiplied;
 

@@ -1,15 +1,15 @@
-// A ray through contracted space: the twin of player/march/contracted.py, which has the letters. A place on the ray is s,
-// an angle behind where it begins.
+// A ray through contracted space. The twin of player/march/contracted.py, which explains the notation. A position on the ray
+// is given by s, the angle from where the ray begins. The functions are those of box.glsl.
 
 uniform vec3 uCellsPerUnit;
 uniform float uStep, uNear;
 uniform int uResolution, uLatticeSize;
-uniform highp sampler2D uLattice; // s and its cosine and sine at every half base step
+uniform highp sampler2D uLattice; // s, cos(s) and sin(s) at every half base step
 
 const float SKIP_MARGIN = 0.01;
 const float MAX_SPEED = 2.23606798;
 const float MIN_COS = 1e-3;
-const float MOST_ANGLE = 1.56979633; // its cosine is MIN_COS
+const float MOST_ANGLE = 1.56979633; // the angle whose cosine is MIN_COS
 
 vec3 rayNearest, rayAlong;
 float rayT, rayWidth, rayCos, raySin, rayLength;
@@ -51,7 +51,7 @@ vec3 placeOf(int n, int size) {
   return onGrid(sampleTurn);
 }
 
-// cos and sin of a small angle.
+// Return cos and sin of a small angle.
 vec2 smallTurn(float x) {
   float y = x * x;
   return vec2(1.0 - y * (0.5 - y * (1.0 / 24.0 - y / 720.0)), x * (1.0 - y * (1.0 / 6.0 - y * (1.0 / 120.0 - y / 5040.0))));
@@ -70,7 +70,7 @@ int jumpFrom(int n, vec3 g, vec3 brick, float reach) {
   return n + max(int(floor(least / (MAX_SPEED * uStep * uCellsPerUnit.x))), 0) + 1;
 }
 
-// cos and sin of phi at any place: from the nearest one of the lattice.
+// Return cos and sin of phi at any s, computed from the nearest entry of the lattice.
 vec2 turnAt(float s) {
   int i = max(int(floor(s / (uStep * 0.5) + 0.5)) - 1, 0);
   vec3 found = latticeAt(i);

@@ -9,13 +9,14 @@
 
 import { looked, moved, orbited, zoomed } from "./pose.js";
 
-const WHEEL = { 0: 1, 1: 16, 2: 400 }; // pixels that a step of a wheel stands for, by its unit
+const WHEEL = { 0: 1, 1: 16, 2: 400 }; // pixels per unit of the wheel, by the event property deltaMode
 const TURN_SPEED = 1.2; // radians a second, by key
-const FLY_SPEED = 0.5; // radii of the cameras' orbit a second
-const KEY_SECONDS = 0.06; // a key that is only tapped moves as far as in so many seconds
-const TAP_SECONDS = 0.35, TAP_PIXELS = 12; // between the two taps of a double tap
+const FLY_SPEED = 0.5; // radii of the orbit of the cameras a second
+const KEY_SECONDS = 0.06; // a tap on a key moves as far as holding it for so many seconds
+const TAP_SECONDS = 0.35, TAP_PIXELS = 12; // most time between the taps of a double tap, and most motion in a tap
 
-// What each held key does: [right, up, ahead, to the right, to the top, nearer]: flying, turning and zooming, -1 to 1.
+// The effect of each held key, -1 to 1: [right, up, ahead] for flying, [to the right, to the top] for turning, and nearer for
+// zooming.
 const KEYS = {
   KeyD: [1, 0, 0, 0, 0, 0], KeyA: [-1, 0, 0, 0, 0, 0], KeyE: [0, 1, 0, 0, 0, 0], KeyQ: [0, -1, 0, 0, 0, 0],
   KeyW: [0, 0, 1, 0, 0, 0], KeyS: [0, 0, -1, 0, 0, 0],
@@ -24,21 +25,21 @@ const KEYS = {
 };
 
 export class Controls {
-  // Listens on the viewer's canvas, and for keys in the whole page where no other control takes them.
+  // Listen on the viewer's canvas, and for keys in the whole page where no other control takes them.
   constructor(viewer) {
     this.viewer = viewer;
     this.flies = false;
-    this.pointers = new Map(); // by identity: { x, y, button }
-    this.held = new Map(); // the keys that are held: name to whether Shift was, too
+    this.pointers = new Map(); // by pointerId: { x, y, sideways }
+    this.held = new Map(); // name of each held key: whether Shift was held, too
     this.tap = { at: 0, x: 0, y: 0, moved: 0 };
-    this.engaged = window.self === window.top; // an embedded page takes the wheel once it was clicked
+    this.engaged = window.self === window.top; // an embedded page takes the wheel only after a click into it
     const { canvas } = viewer;
     const on = (target, type, handler, options) => target.addEventListener(type, handler.bind(this), options);
     on(canvas, "pointerdown", this.down);
     on(canvas, "pointermove", this.drag);
     for (const type of ["pointerup", "pointercancel"]) on(canvas, type, this.up);
     on(canvas, "wheel", this.wheel, { passive: false });
-    on(canvas, "mousedown", (event) => event.button === 1 && event.preventDefault()); // it would scroll
+    on(canvas, "mousedown", (event) => event.button === 1 && event.preventDefault()); // the middle button would scroll
     on(canvas, "contextmenu", (event) => event.preventDefault());
     on(window, "keydown", this.keyDown);
     on(window, "keyup", this.keyUp);
@@ -65,7 +66,7 @@ export class Controls {
     Object.assign(pointer, { x: event.clientX, y: event.clientY });
     if (!dx && !dy) return;
     if (this.pointers.size === 1 && !pointer.sideways) return this.turn(dx, dy);
-    const n = this.pointers.size; // each finger moves the middle of all by its share
+    const n = this.pointers.size; // each finger moves the mean of all fingers by its share
     this.slide(dx / n, dy / n);
     if (before) this.near(before / Math.max(this.spread(), 1));
   }
@@ -79,7 +80,7 @@ export class Controls {
     if (double) this.viewer.turnAround(x, y);
   }
 
-  // The distance between two fingers, pixels; 0 for one.
+  // Return the distance between two fingers in pixels; 0 if there is only one.
   spread() {
     const [a, b] = this.pointers.values();
     return b ? Math.hypot(a.x - b.x, a.y - b.y) : 0;
@@ -88,11 +89,11 @@ export class Controls {
   wheel(event) {
     if (!this.engaged) return;
     event.preventDefault();
-    const pixels = event.deltaY * WHEEL[event.deltaMode] * (event.ctrlKey ? 6 : 1); // Ctrl: a pinch on a touch pad
+    const pixels = event.deltaY * WHEEL[event.deltaMode] * (event.ctrlKey ? 6 : 1); // with Ctrl: a pinch on a touch pad
     this.near(Math.exp(Math.min(Math.max(pixels, -400), 400) * 0.0012));
   }
 
-  // --- what moves mean ---
+  // --- how gestures and keys move the camera ---
 
   turn(dx, dy) {
     const { frame, canvas } = this.viewer, angle = Math.PI / Math.max(canvas.clientHeight, 1);
@@ -128,7 +129,7 @@ export class Controls {
     for (const name of ["+", "=", "-"]) this.held.delete(name);
   }
 
-  // Move as the held keys say for so many seconds; whether there are any.
+  // Move as the held keys say, for so many seconds; return whether any key is held.
   step(seconds) {
     for (const [name, shift] of this.held) this.press(name, shift, seconds);
     return this.held.size > 0;

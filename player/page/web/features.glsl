@@ -1,5 +1,5 @@
-// The features around a place, trilinear over the corners that are stored. The twin of `stored_features` in
-// player/march/fetches.py. FEATURES, ADD_ROW and CLEAR_FEATURES are written by program.js for the number of channels.
+// Interpolates the features at a point, trilinearly over the corners that are stored. The twin of `stored_features` in
+// player/march/fetches.py. FEATURES and ADD_ROW are replaced by code that program.js writes for the number of channels.
 
 uniform int uFeatureResolution;
 uniform float uFeatureScale;
@@ -13,14 +13,14 @@ void addRow(int row, float share) {
   ADD_ROW
 }
 
-// How many of the lowest eight bits are set.
+// Return how many of the lowest eight bits of each component are set.
 ivec4 nSet(uvec4 bits) {
   bits -= (bits >> 1) & 0x55u;
   bits = (bits & 0x33u) + ((bits >> 2) & 0x33u);
   return ivec4((bits + (bits >> 4)) & 15u);
 }
 
-// Adds the features at a place, in cells of the densities' grid; false where too little is stored.
+// Add `weight` times the features at g, in cells of the densities' grid. Returns false where too little is stored.
 bool addFeatures(vec3 g, float weight) {
   g = clamp(g * uFeatureScale, vec3(0), vec3(uFeatureResolution));
   vec3 cell = min(floor(g), vec3(uFeatureResolution - 1));

@@ -1,7 +1,7 @@
-// Where along a ray to fetch features: at the samples, or at the centroids of k bins of equal mass. The twin of
+// Chooses where along a ray features are fetched: at the samples, or at the centroids of k bins of equal mass. The twin of
 // player/march/fetches.py.
 //
-// A ray is marched once, and its samples are kept; one with more than KEPT is marched again.
+// A ray is marched once, and up to KEPT of its samples are kept; a ray that has more is marched again.
 
 uniform int uFetches; // k; 0 fetches at every sample
 
@@ -9,7 +9,8 @@ vec2 kept[KEPT]; // s and weight
 float total = 0.0, moment = 0.0;
 int nWeights = 0;
 
-// All steps of all rays are in one loop, so that those of a group that is drawn together need not wait for each other.
+// March the ray and keep its samples. Jumps and samples are steps of a single loop, so that rays that the GPU draws as a
+// group need not wait for each other.
 void keepSamples(inout March march) {
   float s, weight;
   for (int guard = 0; guard < MOST_STEPS; guard++) {
@@ -22,7 +23,7 @@ void keepSamples(inout March march) {
   }
 }
 
-// The next sample with weight.
+// Find the next sample with weight, among those kept or by marching again; return false if there is none.
 bool again(inout March march, inout int i, out float s, out float weight) {
   if (nWeights > KEPT) {
     for (int guard = 0; guard < MOST_STEPS; guard++) {
@@ -63,7 +64,7 @@ void fetchFeatures(float opacity) {
     if (filled <= 0.0) break;
     float weight = few ? filled : opacity / float(uFetches);
     float place = few ? heavy : sum / filled;
-    for (int attempt = 0; attempt < 2; attempt++) { // in a loop, so that its code is there once
+    for (int attempt = 0; attempt < 2; attempt++) { // a loop, so that the code of addFeatures is compiled only once
       if (addFeatures(placeAt(place), weight) || few) break;
       place = heavy;
     }
@@ -71,7 +72,7 @@ void fetchFeatures(float opacity) {
 }
 #endif
 
-// Where half of the mass is reached.
+// Return s where half of the ray's mass is reached.
 float middlePlace() {
   March march = begun();
   int i = 0;

@@ -1,18 +1,19 @@
-// Arranges a scene for the march on a GPU: flat arrays that become textures. The twin of player/asset/grid.py.
+// Arranges a scene for the march on a GPU: flat arrays that become textures. The twin of player/asset/grid.py. A *place* is
+// the space of one brick of the finest level.
 //
-// - table [nb^3 * 4] Uint8: for a place in a brick of the finest level, at (bx * nb + by) * nb + bz: where the densities of
-//   the finest brick there are, (x, y, z) in bricks, and MANY + its level; or the level of a coarser brick whose cells there
-//   are all dead, if its samples stand for several steps, else 0, then 0, 0 and the distance in bricks to the nearest place
-//   that has a brick, for coarser ones one with a live cell there;
+// - table [nb^3 * 4] Uint8: for the place of brick (bx, by, bz), at (bx * nb + by) * nb + bz: where the densities of the finest
+//   brick there are, (x, y, z) in bricks, and MANY + its level. A coarser brick whose cells in the place are all dead counts as
+//   none. Without a brick: the level of such a dead brick, if samples of that level stand for several steps, else 0; then 0, 0
+//   and the distance in bricks to the nearest place that has a brick;
 // - density [Uint8]: a block of bricks (`blockOf`) of 8 x 8 x 10 texels of four bytes. The texel (x, y, z) of a brick, z = 0..8,
-//   has the codes of the vertices (x, y), (x, y + 1), (x + 1, y) and (x + 1, y + 1), so that a cell is read with two fetches;
-//   that of z = 9 has in its first byte which cells of the column are live, a bit for each;
-// - owners [nf^3 * 4] Uint8: of the brick that holds the feature vertices around a place where its columns are, (x, y, z) in
-//   bricks, and its level; NO_LEVEL where there is none;
+//   has the codes of the vertices (x, y), (x, y + 1), (x + 1, y) and (x + 1, y + 1), so that a cell is read with two fetches.
+//   The first byte of the texel with z = 9 tells which cells of the column are live, a bit for each;
+// - owners [nf^3 * 4] Uint8: for each place of the features, where the columns of the brick that holds the vertices around the
+//   place are, (x, y, z) in bricks, and that brick's level; NO_LEVEL where no brick holds any;
 // - columns [Uint32]: a block of bricks of 9 x 8 x 1 texels of four numbers. The texel (x, y) of a brick has two numbers for
-//   the vertices (x, y, 0..7), and two for (x, y + 1, 0..7): bit z of a number tells whether that vertex is stored, and its
-//   bits from 8 on the row of the first that is; the second number is that of the next brick along z, for the vertex z = 8;
-// - features [Int8]: rows of codes, four a texel, ROWS_A_LINE a line, as parts.js has them.
+//   the vertices (x, y, 0..7), and two for (x, y + 1, 0..7). In the first of two, bit z tells whether that vertex is stored, and
+//   the bits from 8 on are the row of the first that is. The second is the same for the vertex z = 8, in the next brick along z;
+// - features [Int8]: rows of codes as in parts.js, four codes a texel, `rowsALine` rows a line.
 import { coordOf, keyOf, popcount } from "./bricks.js";
 
 const MOST_DISTANCE = 31;
@@ -26,12 +27,14 @@ const AROUND = 9 ** 3; // vertices of a brick with its apron
 
 const bricksAlong = (cells) => Math.ceil(cells / 8);
 
-// Texels that a row of features takes, and how many rows lie beside each other: a power of two, no more than 2048 texels.
+// Return how many texels a row of features takes, and how many rows a line of the texture has: the largest power of two with
+// at most 2048 texels.
 export const featureWords = (nChannels) => Math.ceil(nChannels / 4);
 export const rowsALine = (nChannels) => 2 ** Math.floor(Math.log2(2048 / featureWords(nChannels)));
 
-// How bricks of a texture lie side by side: { across, layers, size: [3] texels }, number n at (n % across, n / across % across,
-// n / across^2). At most 25 layers, so that few places are left over, and no side is longer than it has to be.
+// Arrange n bricks in a texture: { across, layers, size: [3] texels }. Brick i is at (i % across, i / across % across,
+// i / across^2), in bricks. There are at most 25 layers, so that few places are left over, and no side is longer than
+// necessary.
 export function blockOf(n, brick) {
   const across = Math.max(Math.ceil(Math.sqrt(n / 25)), 1), layers = Math.max(Math.ceil(n / across ** 2), 1);
   if (across > 256) throw new Error(`memory of the GPU: expected at most ${25 * 256 ** 2} bricks, got ${n}`);
@@ -40,14 +43,14 @@ export function blockOf(n, brick) {
 
 const placeOf = (n, { across }) => [n % across, Math.floor(n / across) % across, Math.floor(n / across ** 2)];
 
-// Nothing anywhere: what is shown before a scene is.
+// An empty grid, which is shown before that of the scene is there.
 export const NO_GRID = {
   resolution: 1, nb: 1, nSlots: 0, table: Uint8Array.of(0, 0, 0, 1), density: new Uint8Array(2560),
   featureResolution: 1, nf: 1, nHeld: 0, nRows: 0, owners: Uint8Array.of(0, 0, 0, NO_LEVEL), columns: new Uint32Array(288),
   features: new Int8Array(0),
 };
 
-// What the densities `{ levels, vertices, values, firstRows }` of parts.js become: { resolution, nb, nSlots, table, density }.
+// Arrange the densities `{ levels, vertices, values, firstRows }` of parts.js: { resolution, nb, nSlots, table, density }.
 export function arrangeDensities({ resolution, level_steps: levelSteps }, densities) {
   const shown = shownBricks(densities.levels, resolution), nb = bricksAlong(resolution);
   return {
@@ -57,7 +60,7 @@ export function arrangeDensities({ resolution, level_steps: levelSteps }, densit
   };
 }
 
-// What the features become: { featureResolution, nf, nHeld, nRows, owners, columns, features }.
+// Arrange the features of parts.js: { featureResolution, nf, nHeld, nRows, owners, columns, features }.
 export function arrangeFeatures({ feature_resolution: featureResolution }, features) {
   const { n, owners, held, count } = heldBricks(features, featureResolution);
   return {
@@ -68,8 +71,9 @@ export function arrangeFeatures({ feature_resolution: featureResolution }, featu
   };
 }
 
-// The bricks of each level that finer ones do not hide wholly, [{ level, first, bricks, numbers }], in `bricks` of the level
-// those with the `numbers`; `count` of all levels.
+// Find the bricks of each level that finer ones do not hide completely: { levels: [{ level, first, bricks, numbers }], count }.
+// `numbers` are the indices of these bricks among all `bricks` of the level, `first` is how many there are in finer levels, and
+// `count` how many in all levels.
 function shownBricks(levels, resolution) {
   const found = [];
   let first = 0;
@@ -91,7 +95,7 @@ function shownBricks(levels, resolution) {
   return { levels: found, count: first };
 }
 
-// Calls paint(place, i, j, k) for all places of the finest level in the brick at (x, y, z) of a level.
+// Call paint(place, i, j, k) for all places of the finest level in the brick at (x, y, z) of a level.
 function eachPlace(n, level, [x, y, z], paint) {
   const end = (c) => Math.min((c + 1) << level, n);
   for (let i = x << level; i < end(x); i++) {
@@ -101,11 +105,11 @@ function eachPlace(n, level, [x, y, z], paint) {
   }
 }
 
-// A place in a coarse brick none of whose cells there is live is as empty as one without a brick, but that a sample that
-// begins there may stand for several steps.
+// Make the table. A place where all cells of a coarse brick are dead is treated as one without a brick, except that a sample
+// that begins there may stand for several steps.
 function tableOf({ levels, count }, n, levelSteps) {
   const block = blockOf(count, DENSITY_BRICK);
-  const table = new Uint32Array(n ** 3); // four bytes each, the first the lowest
+  const table = new Uint32Array(n ** 3); // four bytes each, the lowest first
   for (const { level, first, bricks, numbers } of [...levels].reverse()) {
     numbers.forEach((number, i) => {
       const [x, y, z] = placeOf(first + i, block), entry = x | (y << 8) | (z << 16) | ((MANY + level) << 24);
@@ -120,7 +124,8 @@ function tableOf({ levels, count }, n, levelSteps) {
   return new Uint8Array(table.buffer);
 }
 
-// Whether a cell of a coarse brick is live at a place of the finest level: 4 x 4 x 4 cells, 2 x 2 x 2, or one.
+// Return whether any cell of a coarse brick is live in a place of the finest level, which covers 4 x 4 x 4 of its cells,
+// 2 x 2 x 2, or one.
 function someLive(cells, level, i, j, k) {
   const count = Math.max(8 >> level, 1);
   const x = ((8 * i) >> level) & 7, y = ((8 * j) >> level) & 7, z = ((8 * k) >> level) & 7;
@@ -133,18 +138,19 @@ function someLive(cells, level, i, j, k) {
   return false;
 }
 
-// Distances in the largest coordinate, in two sweeps over a padded grid, from the neighbours before and behind: four lines of
-// these beside a line of places, and the place before each.
+// Add the distances (the largest difference of any coordinate) to the places without a brick. There are two sweeps over a
+// padded grid, from the neighbours before each place and from those behind: places in four neighbouring lines, three in each,
+// and the place before in the same line.
 function addDistances(table, n) {
   const isBrick = (entry) => entry >= 2 ** 24;
   const m = n + 2, distances = new Uint8Array(m ** 3).fill(MOST_DISTANCE), least = new Uint8Array(m);
-  const padded = (x, y) => ((x + 1) * m + y + 1) * m + 1; // where the line of z = 0... begins
+  const padded = (x, y) => ((x + 1) * m + y + 1) * m + 1; // where the line of places from z = 0 on begins
   for (let x = 0, at = 0; x < n; x++) {
     for (let y = 0; y < n; y++) {
       for (let to = padded(x, y), end = to + n; to < end; at++, to++) if (isBrick(table[at])) distances[to] = 0;
     }
   }
-  // `sign`: 1 where the lines before are looked at, -1 for those behind; the z before a place then is z - sign.
+  // `sign`: 1 to look at the lines before, -1 for those behind. The place before in the same line is at z - sign.
   const sweepLine = (first, sign) => {
     const a = first - sign * (m * m + m) - 1, b = a + sign * m, c = b + sign * m, d = first - sign * m - 1;
     for (let i = 0; i < m; i++) least[i] = Math.min(distances[a + i], distances[b + i], distances[c + i], distances[d + i]);
@@ -163,7 +169,7 @@ function addDistances(table, n) {
   }
 }
 
-// Where the texels of a brick begin.
+// Return the index of the first texel of brick n in a block.
 function firstTexel(n, block, [nx, ny, nz]) {
   const [x, y, z] = placeOf(n, block), [width, height] = block.size;
   return (nz * z * height + ny * y) * width + nx * x;
@@ -185,7 +191,7 @@ function densityTexels({ vertices, values, firstRows }, { levels, count }) {
   return new Uint8Array(texels.buffer);
 }
 
-// The codes of a brick with its apron, 0 where a vertex is not stored.
+// Read the codes of a brick with its apron into `codes`, at 81 z + 9 y + x; 0 where a vertex is not stored.
 function gatherCodes(read, values, codes) {
   for (let x = 0; x < 9; x++) {
     for (let y = 0; y < 9; y++) {
@@ -218,8 +224,8 @@ function putLive(masks, word, texels, begin, width) {
   }
 }
 
-// Reads the columns along z of one brick with its apron: `mask` has a bit for each stored vertex z = 0..8, `row` is
-// the row of the first of z = 0..7, `row8` that of z = 8.
+// A reader of the columns along z of one brick with its apron. `mask` has a bit for each stored vertex z = 0..8, `row` is
+// the row of the first stored one of z = 0..7, `row8` that of z = 8.
 class ColumnReader {
   constructor({ bricks, ranks }, firstRow) {
     Object.assign(this, { vertices: bricks, firstRows: ranks.first, firstRow, bricks: new Int32Array(8), mask: 0, row: 0, row8: 0 });
@@ -249,10 +255,10 @@ class ColumnReader {
   }
 }
 
-// Which bricks hold the features' vertices, as `vertex_rows` in player/asset/grid.py says.
+// Find the bricks that hold the features' vertices around each place, as `vertex_rows` in player/asset/grid.py does.
 function heldBricks({ levels, vertices, firstRows }, resolution) {
   const n = bricksAlong(resolution);
-  const owners = new Int32Array(n ** 3).fill(-1); // number << 3 | level, or -2 minus that: a corner is stored, but no brick
+  const owners = new Int32Array(n ** 3).fill(-1); // number << 3 | level; -2 minus that: no brick, but a stored corner
   const shown = shownBricks(levels, resolution).levels;
   const held = [];
   let count = 0;
@@ -273,7 +279,8 @@ function heldBricks({ levels, vertices, firstRows }, resolution) {
   return { n, owners, held, count };
 }
 
-// Keys, sorted, of the bricks in which a cell has a stored corner, there or in the next brick, where `wanted`.
+// Return the sorted keys of the bricks that have a cell with a stored corner, be it in the same or in the next brick, and for
+// which `wanted` is true. `n`: bricks of the level along an axis.
 function withCorners({ keys, masks }, n, wanted) {
   const marked = new Uint8Array(n ** 3), found = [];
   keys.forEach((key, i) => {
@@ -323,7 +330,7 @@ function putColumns(read, texels, begin, width) {
 }
 
 function ownerTexels(owners, count) {
-  const block = blockOf(count, COLUMN_BRICK), texels = new Uint32Array(owners.length); // four bytes each, the first the lowest
+  const block = blockOf(count, COLUMN_BRICK), texels = new Uint32Array(owners.length); // four bytes each, the lowest first
   for (let i = 0; i < owners.length; i++) {
     const [x, y, z] = placeOf(owners[i] >> 3, block);
     texels[i] = owners[i] < 0 ? NO_LEVEL << 24 : x | (y << 8) | (z << 16) | ((owners[i] & 7) << 24);

@@ -1,12 +1,12 @@
-// What the address of the page asks for: #view=12&quality=exact&noui&turn&background=white
+// Reads the options in the address of the page: #view=12&quality=exact&noui&turn&background=white
 
 const COLOURS = { white: [1, 1, 1], black: [0, 0, 0], transparent: "transparent" };
 
-// The options in the text behind `#`; what is not there, or cannot be read, is undefined.
+// Return the options in the text behind `#`. An option that is not there, or cannot be read, is undefined.
 //
-// view: number of a training view, from 0; quality: "exact", "high" or "fast"; noui: true for the picture alone; turn:
+// view: number of a training view, from 0; quality: "exact", "high" or "fast"; noui: true to show the picture alone; turn:
 // whether the scene turns until it is touched, and, if true, again when nobody has touched it for some time; background:
-// white, black, transparent or R,G,B in 0..255, as [r, g, b] in 0..1 or "transparent".
+// white, black, transparent or R,G,B in 0..255, returned as [r, g, b] in 0..1 or "transparent".
 export function optionsOf(hash) {
   const given = new URLSearchParams(hash.replace(/^#/, ""));
   const options = {};

@@ -1,5 +1,5 @@
-// The head of 2 x 2 pixels: what the march has found for them becomes their colours, four bytes each. What is in
-// capitals, but for the constants here, is written by head.js and program.js.
+// Runs the head for 2 x 2 pixels: turns what the march has found for them into colours, four bytes each. Names in capitals,
+// except the constants here, are replaced by texts that head.js and program.js write.
 
 FOUND_INPUTS
 uniform highp usampler2D uOpacity;
@@ -7,8 +7,9 @@ uniform highp sampler2D uWeights;
 
 layout(location = 0) out uvec4 colours;
 
-// Of each layer: texels of inputs and outputs, and where they are in the memory; the first texel of its weights, what
-// becomes of its outputs, 1 / scale and zero where they are rounded; whether they are added to what is there.
+// Three vectors for each layer: the numbers of texels of its inputs and outputs, and where these begin in the memory; the
+// first texel of its weights, what is done to its outputs, and 1 / scale and zero of their rounding; and whether outputs are
+// added to what is there.
 uniform vec4 uLayers[3 * N_LAYERS];
 
 const float ACTIVATED = 1.0, ROUNDED = 2.0;
@@ -19,7 +20,7 @@ vec4 weight(int k) {
   return texelFetch(uWeights, ivec2(k & 1023, int(float(k) * (1.0 / 1024.0))), 0);
 }
 
-// x (1 + erf(x / sqrt 2)) / 2, with the error function of Abramowitz and Stegun, 7.1.28: to 5e-7.
+// Return x (1 + erf(x / sqrt 2)) / 2 to 5e-7, with the error function of Abramowitz and Stegun, 7.1.28.
 vec4 gelu(vec4 x) {
   vec4 y = abs(x);
   vec4 q = 1.0 + y * (0.04986734697 + y * (0.02114100615 + y * (0.003277626324 + y * (3.8003575e-5 + y * (4.889063564e-5 + y * 5.382975e-6)))));

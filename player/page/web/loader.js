@@ -1,8 +1,9 @@
-// Finds the files of a scene, in the page or beside it, has them decoded in workers, and yields what is known:
+// Finds the files of a scene, in the page or beside it, has them decoded in workers, and yields what is known so far:
 //
 //     for await (const scene of loadScene(onProgress)) ...
 //
-// yields at once, when `grid` is null, then after the first part, and after later ones. A scene is
+// The first scene has no grid yet. Others follow after the first part and, if the files are beside the page, after each
+// later part; otherwise only after the last. A scene is
 //
 //     { manifest, cameras, head, grid, n_parts, problem }
 //
@@ -10,14 +11,14 @@
 // - cameras: [{ name, width, height, fx, fy, cx, cy, c2w: [16], row-major, OpenGL axes, world frame }, ...];
 // - head: { sh_degree, in_8_bits, activation, n_channels, spatial: [layer, ...], to_sh: layer, harmonics: layer,
 //   bottleneck: layer, from_sh: layer, directional: [layer, ...], output: layer, roundings: [{ scale, zero }, ...],
-//   of_encoded: one of these or null, monomials: [[parent, axis], ...] }, as player/head/graph.py names them. A layer is
-//   { n_in, n_out, weight, bias, scale }: weight [n_in * n_out] row-major, bias [n_out], scale [n_out] or null: Float32Array,
-//   or in 8 bits weight an Int8Array and bias an Int32Array. A monomial is the product of an earlier one (its place in the list, -1
-//   for 1) and the axis 0 to 2 of the direction;
-// - grid: the arrays of grid.js;
-// - n_parts: how many parts are read; problem: a sentence about a part that could not be, or null.
+//   of_encoded: { scale, zero } or null, monomials: [[parent, axis], ...] }, as player/head/graph.py names them. A layer is
+//   { n_in, n_out, weight, bias, scale }: weight [n_in * n_out] row-major, bias [n_out], scale [n_out] or null. All are
+//   Float32Array, but in 8 bits weight is an Int8Array and bias an Int32Array. A monomial is the product of an earlier one
+//   (its place in the list, -1 for 1) and the axis 0 to 2 of the direction;
+// - grid: the arrays of grid.js, or null;
+// - n_parts: how many parts have been read; problem: a sentence about a part that could not be read, or null.
 //
-// onProgress({ done, total }) tells how far it is, half of it for bytes that are there and half for those decoded.
+// onProgress({ done, total }) is told the progress in bytes: half of the total is for loading and half for decoding.
 
 import { SceneReader, checkedFile } from "./scene_reader.js";
 
@@ -43,18 +44,19 @@ export async function* loadScene(onProgress) {
     done.decoded += n;
     tell();
   });
-  // Has a part decoded, and arranged where it is shown; resolves when that is asked for, and the next may be.
+  // Ask the readers to decode a part and, if it is shown, to arrange the grid. Resolves to the promises of both as soon as
+  // that is asked for; then the next part may be asked for.
   const begin = async (part, isShown) => {
     const file = await get(manifest.parts[part].file);
     const asked = { read: read(file), grid: isShown ? readers.grid(part + 1 === nParts) : null };
-    for (const promise of [asked.read, asked.grid]) promise?.catch(() => {}); // told when it is their turn
+    for (const promise of [asked.read, asked.grid]) promise?.catch(() => {}); // errors are reported when these are awaited
     return asked;
   };
   let scene = { manifest, cameras, head, grid: null, n_parts: 0, problem: null };
   try {
     const begun = [];
     for (let part = 0; part < nParts; part++) {
-      // What a page holds is there at once: one picture, and the whole.
+      // The data inside a page is there at once: only the first part and the whole scene are shown.
       const isShown = part === 0 || part + 1 === nParts || !isFile;
       begun.push(part ? begun[part - 1].then(() => begin(part, isShown)) : begin(part, isShown));
       begun[part].catch(() => {});
@@ -78,7 +80,7 @@ export async function* loadScene(onProgress) {
   }
 }
 
-// The text of a file of the data in the page, which gives it away.
+// Return the text of a file of the data in the page, and remove it from there, except the manifest.
 function textInPage(name) {
   const element = document.querySelector(`script[data-file="${name}"]`);
   if (!element) throw new Error(`${name}: expected it in the page, got none: the page was cut short`);
@@ -87,7 +89,7 @@ function textInPage(name) {
   return text;
 }
 
-// A file beside the page, as bytes; `onBytes` is told how many more are there.
+// Fetch a file beside the page, as bytes; `onBytes` is called with the number of bytes each time some arrive.
 async function fetched(name, entry, onBytes = () => {}) {
   const response = await fetch(name);
   if (!response.ok) throw new Error(`${name}: expected it beside the page, got ${response.status}`);
@@ -115,7 +117,7 @@ function parsed(name, content, isFile) {
 
 const TYPES = { float32: Float32Array, int8: Int8Array, int32: Int32Array };
 
-// The head's description with the numbers in their places.
+// Return the head's description with its arrays in place, taken from `data`, the bytes of head.bin.
 function headOf(description, data) {
   const numbers = data.slice().buffer;
   const array = (entry, length) => entry && new TYPES[entry.type](numbers, entry.first, length);
@@ -128,7 +130,7 @@ function headOf(description, data) {
   return head;
 }
 
-// SceneReaders that share the grids of a scene.
+// SceneReaders that each read some of the grids of one scene.
 class Readers {
   constructor(readers) {
     this.readers = readers;
@@ -152,7 +154,7 @@ class Readers {
   }
 }
 
-// A worker for each grid; one reader in the page itself where no workers can be had.
+// Start a worker for each grid; where there can be no workers, one reader in the page itself.
 async function startReaders(manifest) {
   const workers = [];
   try {
@@ -167,13 +169,13 @@ async function startReaders(manifest) {
   }
 }
 
-// What is wrong with a scene, where the worker is not to blame.
+// An error of the scene, for which the worker is not to blame.
 class SceneError extends Error {}
 
 // A SceneReader in a worker.
 class WorkerReader {
   constructor(manifest, grids) {
-    const own = document.getElementById("script").textContent; // of a page in one file
+    const own = document.getElementById("script").textContent; // empty unless the page is one file
     const address = own && URL.createObjectURL(new Blob([own], { type: "text/javascript" }));
     this.worker = own ? new Worker(address) : new Worker("worker.js", { type: "module" });
     this.waiting = new Map();

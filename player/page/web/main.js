@@ -1,4 +1,4 @@
-// Where the page begins: the scene is loaded and drawn, and handed to the viewer and to programs.
+// The page's entry point: loads and draws the scene, and hands it to the viewer and to programs.
 
 import { installApi } from "./api.js";
 import { Controls } from "./controls.js";
@@ -14,13 +14,13 @@ const ANEW = "What arrived is not whole: load the page again, or ask for it anew
 const RESET = "The graphics card was reset. If the picture does not come back by itself, "
   + "load the page again.";
 
-// Shows the scene; the renderer, when all of it is there.
+// Show the scene; resolve to the renderer when all of the scene is there.
 async function show() {
   const options = optionsOf(location.hash), canvas = document.getElementById("canvas");
   const panel = new Panel(options);
   const calm = matchMedia("(prefers-reduced-motion: reduce)").matches;
   let renderer = null, viewer = null, problem = null, advice = ANEW;
-  let said = "Loading…"; // below the picture, while the graphics card is there
+  let said = "Loading…"; // the text below the picture, unless the graphics card was reset
   panel.say(said);
   canvas.addEventListener("webglcontextlost", () => panel.say(RESET));
   try {
@@ -28,13 +28,13 @@ async function show() {
       problem = scene.problem;
       advice = INSTEAD;
       if (!renderer) {
-        // its shaders are compiled while the scene is unpacked
+        // its shaders are compiled while the scene is being unpacked
         renderer = await Renderer.create(canvas, scene);
         renderer.onrestored = () => {
           viewer?.restored();
           panel.say(said);
         };
-        panel.say(said); // what was lost meanwhile is back
+        panel.say(said); // replaces RESET if the context was lost meanwhile and is back
       }
       if (scene.grid) renderer.replace(scene);
       advice = ANEW;

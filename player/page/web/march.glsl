@@ -1,17 +1,17 @@
-// The march of a ray from sample to sample: the twin of player/march/march.py, which has the letters.
+// Marches a ray from sample to sample. The twin of player/march/march.py, which explains the notation.
 
 uniform float uMostTau;
 uniform vec2 uDensityCode; // log sigma at code 0, and its slope
-uniform int uLevelSteps[8], uLongestStep; // base steps that a sample of each level stands for, and the most of all
+uniform int uLevelSteps[8], uLongestStep; // most base steps that a sample of each level, and of any level, stands for
 
 struct March {
   int n; // the base step to go on with
   float tau;
-  vec3 brick; // the last that was looked at, in bricks of the finest level,
-  ivec3 first; // where its densities begin,
-  int reach; // how far around it all is empty, in bricks; -1 where it is not
-  float scale; // cells of its level a cell of the finest
-  int size; // base steps that a sample in it stands for, were it live
+  vec3 brick; // place of the last lookup, in bricks of the finest level
+  ivec3 first; // first texel of the densities of the brick there
+  int reach; // distance in bricks up to which all places around are empty; -1 with a brick
+  float scale; // cells of its level per cell of the finest level, along an axis
+  int size; // most base steps that a sample that begins there stands for
 };
 
 March begun() {
@@ -39,13 +39,15 @@ vec3 cellOf(vec3 g) {
   return clamp(floor(g), vec3(0), vec3(uResolution - 1));
 }
 
-// The interpolated code in a cell of the finest level that has a brick; false where the cell is not live.
+// Interpolate the code at g, which is in `cell` of the finest level, in the brick of the last lookup; for normals also find
+// its slope. Returns false if the brick's cell is not live.
 bool codeAt(March march, vec3 g, vec3 cell, out float code, out vec3 slope) {
   vec3 own = floor(cell * march.scale), share = g * march.scale - own;
   ivec3 local = ivec3(own) & 7, at = march.first + local;
   int live = int(densityAt(ivec3(at.xy, march.first.z + 9)).r * 255.0 + 0.5);
   if ((live & (1 << local.z)) == 0) return false;
-  vec4 low = densityAt(at) * 255.0, high = densityAt(at + ivec3(0, 0, 1)) * 255.0; // the corners (x, y), (x, y + 1), (x + 1, y), (x + 1, y + 1)
+  // The four corners are (x, y), (x, y + 1), (x + 1, y), (x + 1, y + 1).
+  vec4 low = densityAt(at) * 255.0, high = densityAt(at + ivec3(0, 0, 1)) * 255.0;
   vec4 e = low + (high - low) * share.z;
   vec2 f = e.xz + (e.yw - e.xz) * share.y;
   code = f.x + (f.y - f.x) * share.x;
@@ -57,12 +59,13 @@ bool codeAt(March march, vec3 g, vec3 cell, out float code, out vec3 slope) {
   return true;
 }
 
-// -expm1(-x)
+// Return -expm1(-x), by its series if x is small.
 float alphaOf(float x) {
   return x < 0.03 ? x * (1.0 - x * (0.5 - x * (1.0 / 6.0 - x * (1.0 / 24.0)))) : 1.0 - exp(-x);
 }
 
-// Moves on by one step, a jump over what is empty or a sample; false at the ray's end. Without a sample its weight is 0.
+// Go on by one step: a jump over empty space, or a sample at s with a weight. The weight is 0 if there is no sample. Returns
+// false at the ray's end.
 bool stepOn(inout March march, out float s, out float weight) {
   weight = 0.0;
   vec3 g = placeOf(march.n, 1);
@@ -73,8 +76,8 @@ bool stepOn(inout March march, out float s, out float weight) {
   if (march.n != 0) size = min(size, march.n & -march.n);
   if (march.reach >= 0) {
     int there = jumpFrom(march.n, g, march.brick, float(march.reach)), after = march.n + size;
-    if (after <= there) { // else its middle may be in a live cell
-      march.n = max(there & -uLongestStep, after); // a step that the march comes by
+    if (after <= there) { // otherwise the middle of the sample may be in a live cell
+      march.n = max(there & -uLongestStep, after); // a step that every march visits
       return true;
     }
   }

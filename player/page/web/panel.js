@@ -1,5 +1,5 @@
-// The bar below the picture: its buttons and their keys, the help card, the picture as a file, full screen, and the line
-// that says how far things are.
+// The bar below the picture: its buttons and their keys, the help card, saving the picture, full screen, and the line of
+// text about the state of things.
 
 import { Views } from "./views.js";
 
@@ -7,7 +7,7 @@ const LAYERS = ["colour", "depth", "normals", "opacity"];
 const element = (id) => document.getElementById(id);
 
 export class Panel {
-  // What is there before a scene is: `options` are those of the page's address.
+  // Set up what is shown before there is a scene; `options` are those of the page's address.
   constructor(options) {
     document.body.classList.toggle("plain", Boolean(options.noui));
     document.body.classList.toggle("clear", options.background === "transparent");
@@ -17,18 +17,18 @@ export class Panel {
     card.addEventListener("click", (event) => event.target === card && card.close()); // beside the card
   }
 
-  // A line below the picture; "" takes it away. What `fail` said stays.
+  // Show a line of text below the picture; "" removes it. After `fail`, its text stays.
   say(text) {
     if (!document.body.classList.contains("failed")) element("status").textContent = text;
   }
 
-  // How much of the scene is there, 0..1; 1 takes the bar of progress away.
+  // Show how much of the scene is there, 0..1; 1 removes the progress bar.
   progress(share) {
     element("progress").value = share;
     element("progress").hidden = share >= 1;
   }
 
-  // The scene cannot be shown: the poster stays, and a sentence says what to do.
+  // Report that the scene cannot be shown: the poster stays, and `text` says what to do.
   fail(text) {
     this.progress(1);
     this.say(text);
@@ -71,9 +71,9 @@ export class Panel {
     window.addEventListener("keydown", (event) => {
       const action = keys[event.key.length > 1 ? event.key : event.key.toLowerCase()];
       const taken = event.target.closest?.(`select, input, dialog[open]${event.key === " " ? ", button" : ""}`);
-      const bracket = event.altKey && "[]".includes(event.key); // behind AltGr or Option
+      const bracket = event.altKey && "[]".includes(event.key); // a bracket typed with AltGr or Option
       if (!action || taken || event.repeat || event.metaKey) return;
-      if (!bracket && (event.ctrlKey || event.altKey)) return; // it is the browser's
+      if (!bracket && (event.ctrlKey || event.altKey)) return; // the browser handles it
       event.preventDefault();
       action();
     });

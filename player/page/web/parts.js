@@ -4,13 +4,14 @@ import { Decoder, SYMBOL_OF_ZERO } from "./coder.js";
 import { Pyramid, putValues } from "./pyramid.js";
 import { decodeStructure } from "./structure.js";
 
-// Most memory that a scene may take while it is decoded, bytes: browsers end a page that asks for much more.
-const MOST_BYTES = 3 * 2 ** 30;
+// The most bytes of memory that a scene may take while it is decoded: browsers end a page that asks for much more.
+const MOST_BYTES = 3200e6;
 
-// One of the two pyramids, as far as its sections have been read: values of levels that are not known are not there,
-// symbols that are not known are 0. Values follow from symbols when they are asked for, all channels of a level at once.
+// One of the two pyramids, as far as its sections have been read. A level whose structure has not been read has no values,
+// and a symbol that has not been read is 0. Values are computed from symbols when they are asked for, all channels of a
+// level at once.
 class PyramidReader {
-  // `structures`: the structure sections that the parts will bring.
+  // `structures`: the structure sections of this pyramid in all parts.
   constructor(grid, manifest, structures) {
     const isFeatures = grid === "features";
     this.steps = isFeatures ? manifest.feature_steps : manifest.density_steps;
@@ -18,13 +19,14 @@ class PyramidReader {
     this.stride = isFeatures ? 4 * Math.ceil(this.nChannels / 4) : 1; // numbers from one row of values to the next
     [this.low, this.high] = isFeatures ? [-127, 127] : [0, 255];
     this.pyramid = new Pyramid(isFeatures ? manifest.feature_resolution : manifest.resolution, this.steps.length);
-    this.nKnown = this.steps.map(() => 0); // channels of each level whose symbols are read
-    this.nPut = this.steps.map(() => 0); // channels of each level whose values follow from symbols that are read
-    this.symbols = this.steps.map(() => null); // those of the channels from nPut on, channel by channel, + 63
-    this.beyond = this.steps.map(() => []); // and for each of these channels that is read { bytes, first }: see putValues
-    this.rows = null; // of the level whose symbols were read last
+    this.nKnown = this.steps.map(() => 0); // for each level, how many channels have symbols that were read
+    this.nPut = this.steps.map(() => 0); // for each level, how many channels have values computed from these
+    this.symbols = this.steps.map(() => null); // of the channels from nPut on, channel by channel, + 63; null: all 0
+    this.beyond = this.steps.map(() => []); // for those of these channels that were read, { bytes, first }: see putValues
+    this.rows = null; // rows of the level whose symbols were read last
     this.rowsLevel = -1;
-    // Rows of all levels, the finest first; a level that is not known yet has none in what is handed out.
+    // The first row of each level, the finest level first. `values` leaves out the rows of the finest levels while they are
+    // not known.
     const nRows = this.steps.map((_, level) => structures.find((s) => s.level === level)?.n_vertices ?? 0);
     this.firstRows = [0];
     for (const n of nRows) this.firstRows.push(this.firstRows.at(-1) + n);
@@ -49,7 +51,7 @@ class PyramidReader {
   async readSymbols(section, data, where, pause) {
     const { level, first_channel: first, n_channels: n } = section;
     if (this.rowsLevel !== level) {
-      this.rows = null; // before the next are made
+      this.rows = null; // frees them before the next rows are made
       this.rows = this.pyramid.vertices[level].rows();
       this.rowsLevel = level;
     }
@@ -87,7 +89,8 @@ class PyramidReader {
     this.beyond[level] = [];
   }
 
-  // What is known so far. `isLast`: the arrays are handed out themselves, and this is at its end.
+  // Return what is known so far. `isLast`: nothing will be asked for afterwards, so that `values` may be the array itself
+  // instead of a copy.
   values(isLast) {
     const { pyramid, nChannels, stride } = this;
     for (let level = this.steps.length - 1; level >= 0; level--) this.put(level);
@@ -105,9 +108,10 @@ class PyramidReader {
   }
 }
 
-// Reads the sections of some `grids`, "densities" and "features", and passes over those of others.
+// A reader of the sections of some `grids`, out of "densities" and "features", which skips the others' sections.
 export class PartsReader {
-  // `manifest`: that of the page, which Python has checked. Throws an Error if the scene takes more memory than it may.
+  // `manifest`: the page's manifest, which Python has checked. Throws an Error if the scene takes more memory than
+  // MOST_BYTES.
   constructor(manifest, grids) {
     this.manifest = manifest;
     const structures = manifest.parts.flatMap((part) => part.sections).filter((s) => s.kind === "structure");
@@ -122,9 +126,9 @@ export class PartsReader {
     this.nRead = 0;
   }
 
-  // Reads the next part, Uint8Array. Rejects with an Error if it breaks the format; what is known is then that of the
-  // parts before it no longer, and the reader is at its end. `onProgress` is told the bytes of each section, `pause` is
-  // awaited between channels.
+  // Read the next part, a Uint8Array. Rejects with an Error if the part breaks the format; as some of it may have been read
+  // by then, the reader must not be used afterwards. `onProgress` is called with the bytes of each section that was read,
+  // and `pause` is awaited between channels.
   async read(data, onProgress = () => {}, pause = async () => {}) {
     const part = this.manifest.parts[this.nRead];
     let at = 0;
@@ -141,17 +145,18 @@ export class PartsReader {
     this.nRead++;
   }
 
-  // What is known of each grid: { n_channels, stride, levels, vertices, values, firstRows }. `levels` are the Bricks of each
-  // level, the finest first, `vertices` its Vertices; `values` [n_rows * stride] Uint8Array for densities, Int8Array for
-  // features, has a row for each vertex of each level, the border's too, levels one after the other, in a level by brick
-  // of vertices and then by bit, padded to whole words for features; `firstRows` [n_levels + 1].
+  // Return what is known of each grid: { n_channels, stride, levels, vertices, values, firstRows }. `levels` are the Bricks of
+  // each level, the finest first, `vertices` its Vertices. `values` [n_rows * stride], Uint8Array for densities, Int8Array for
+  // features, has a row for each vertex, including those on the border. Rows are sorted by level, then by brick of vertices,
+  // then by bit; those of features are padded to a multiple of four numbers. `firstRows` [n_levels + 1]: the first row of each
+  // level, and the number of rows. `isLast`: nothing will be asked for afterwards.
   values(isLast) {
     return Object.fromEntries(Object.entries(this.grids).map(([name, grid]) => [name, grid.values(isLast)]));
   }
 }
 
-// Memory that a level takes, at most: bytes a brick and a vertex are those of the arrays of this module and of
-// pyramid.js, the rows of one level and symbols of a section of all channels among them.
+// Return the most bytes of memory that a level takes. The bytes per brick and per vertex are those of the arrays in this
+// module and in pyramid.js, including the rows of one level and the symbols of a section with all channels.
 function neededBytes(structure, manifest) {
   const nChannels = structure.grid === "features" ? manifest.n_channels : 1;
   return 2000 * structure.n_bricks + (40 + 2 * nChannels) * structure.n_vertices;

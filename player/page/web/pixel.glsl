@@ -1,5 +1,5 @@
-// A pixel: its ray, what the ray meets, and the layer that is asked for; of the colour what the head is to know, two
-// features a word. FOUND_OUTPUTS, CLEAR_FEATURES and WRITE_FOUND are written by program.js.
+// Draws a layer of a pixel: marches its ray and writes what the layer shows. For the colour it writes what the head needs,
+// two features a word. FOUND_OUTPUTS, CLEAR_FEATURES and WRITE_FOUND are replaced by code that program.js writes.
 
 uniform vec3 uOrigin;
 uniform float uStart, uScale;
@@ -14,7 +14,7 @@ FOUND_OUTPUTS
 out vec4 picture;
 #endif
 
-// Dark blue to yellow, rising in lightness.
+// Return a colour for x from 0 to 1: dark purple to yellow, rising in lightness.
 vec3 coloured(float x) {
   x = clamp(x, 0.0, 1.0) * 4.0;
   vec3 a = mix(vec3(68, 1, 84), vec3(59, 82, 139), min(x, 1.0));

@@ -1,16 +1,16 @@
 // The camera's mathematics: pure functions of numbers, for the page's viewer.
 //
-// A frame is where a scene is looked at from: { axes: [east, north, up], radius }, three unit vectors at right angles and
-// the cameras' usual distance from what they look at, in units of the world.
+// A frame describes how a scene is looked at: { axes: [east, north, up], radius }. `axes` are three unit vectors at right
+// angles; `radius` is the cameras' median distance from the point that they look at, in world units.
 //
-// A pose says where a camera is by the point that it turns around:
+// A pose describes a camera by the point that it turns around:
 //
 //     { target: [3], distance, azimuth, elevation, roll, lens: { x, y, shiftX, shiftY, pixel } }
 //
-// target: in the world frame; distance: from there to the camera, world units; azimuth, elevation, roll: radians, in a
-// frame's axes, of which up is elevation 90 degrees; roll is positive where the camera is turned against the clock.
-// lens: x and y are the tangents of half the angle of view that has to fit into the window; shiftX and shiftY the place of
-// the optical axis, pixels from the middle by the focal length in x; pixel is fy / fx.
+// target: the point, world frame; distance: from there to the camera, world units; azimuth, elevation, roll: radians, in the
+// axes of a frame, where straight up is elevation 90 degrees; roll is positive if the camera is turned anticlockwise.
+// lens: x and y are the tangents of half the angles of view that have to fit into the window; shiftX and shiftY are the
+// position of the optical axis, in pixels from the middle, divided by the focal length fx; pixel is fy / fx.
 //
 // Cameras' matrices c2w are 16 numbers, row by row, OpenGL axes: x right, y up, and the camera looks along -z.
 
@@ -31,7 +31,8 @@ function median(values) {
   return sorted.length % 2 ? sorted[half] : (sorted[half - 1] + sorted[half]) / 2;
 }
 
-// The solution of the 3 equations (sum of v v^T / n) x + weight x = b, by Cramer's rule.
+// Solve the 3 equations (A + weight I) x = b by Cramer's rule, where A is the mean of v v^T over the vectors; with `across`
+// the mean of I - v v^T.
 function solved(vectors, weight, b, across) {
   const rows = [0, 1, 2].map((i) => [0, 1, 2].map((j) => {
     const product = vectors.reduce((sum, v) => sum + v[i] * v[j], 0) / vectors.length;
@@ -42,15 +43,16 @@ function solved(vectors, weight, b, across) {
   return [0, 1, 2].map((i) => columns.reduce((sum, c, j) => sum + c[i] * b[j], 0) / determinant);
 }
 
-// The world's up: at right angles to the cameras' right hands as well as it can be. The twin of `world_up` in
-// player/cameras/camera.py.
+// Return the world's up, the direction most nearly at right angles to the cameras' right-hand directions. The twin of
+// `world_up` in player/cameras/camera.py.
 export function worldUp(cameras) {
   const ups = cameras.map((camera) => column(camera.c2w, 1));
   const average = unit(mean(ups), ups[0]), weight = 1e-3;
   return unit(solved(cameras.map((camera) => column(camera.c2w, 0)), weight, average.map((v) => v * weight)), average);
 }
 
-// The point that is nearest to all optical axes. The twin of `focus_point` in player/cameras/camera.py.
+// Return the point that is nearest to all optical axes; if it is behind the cameras, a point ahead of the mean camera. The
+// twin of `focus_point` in player/cameras/camera.py.
 export function focusPoint(cameras) {
   const origins = cameras.map((camera) => column(camera.c2w, 3));
   const forwards = cameras.map((camera) => unit(column(camera.c2w, 2).map((v) => -v), [0, 0, -1]));
@@ -64,8 +66,9 @@ export function focusPoint(cameras) {
   return add(middle, median(depths) > -1e-6 ? point : ahead, unitLength);
 }
 
-// The frame of some cameras, { axes, radius }, and the pose to begin with: level, at the cameras' median distance and
-// elevation from what they look at, in the middle of their turn around it; beside the first where they stand all around.
+// Return { frame, pose }: the frame { axes, radius } of some cameras, and the pose to begin with. That pose is level, at the
+// cameras' median distance and elevation from what they look at, and in the mean of their directions from there; where
+// cameras stand all around, in the direction of the first.
 export function restOf(cameras) {
   const up = worldUp(cameras), target = focusPoint(cameras);
   const arms = cameras.map((camera) => add(column(camera.c2w, 3), target, -1));
@@ -84,7 +87,7 @@ export function restOf(cameras) {
   return { frame: { axes, radius }, pose };
 }
 
-// Straight above, left and right mean nothing.
+// The steepest elevations of the first pose and of moves: straight above, left and right mean nothing.
 const MOST_ELEVATION = 85 / 180 * Math.PI;
 const STEEPEST = 89.5 / 180 * Math.PI;
 
@@ -95,7 +98,7 @@ function lensOf({ width, height, fx, fy, cx, cy }) {
   };
 }
 
-// The pose of a camera with a matrix and a lens, which turns around a point `distance` ahead of it.
+// Return the pose of a camera with a matrix and a lens, which turns around a point `distance` ahead of it.
 function poseFrom({ axes }, c2w, distance, lens) {
   const back = unit(column(c2w, 2), [0, 0, 1]), right = column(c2w, 0);
   const [east, north, up] = axes.map((axis) => dot(axis, back));
@@ -106,14 +109,14 @@ function poseFrom({ axes }, c2w, distance, lens) {
   return { target: add(column(c2w, 3), back, -distance), distance, azimuth, elevation, roll, lens };
 }
 
-// The pose of a training view. It turns around what is as far ahead as `focus`, the point that all cameras look at, or as
-// far as cameras usually are from that where it is not ahead.
+// Return the pose of a training view. It turns around a point as far ahead as `focus`, the point that all cameras look at;
+// if `focus` is not ahead, the point is as far ahead as the frame's radius.
 export function poseOf(frame, camera, focus) {
   const ahead = -dot(add(focus, column(camera.c2w, 3), -1), unit(column(camera.c2w, 2), [0, 0, 1]));
   return poseFrom(frame, camera.c2w, ahead > frame.radius / 10 ? ahead : frame.radius, lensOf(camera));
 }
 
-// The matrix c2w, 16 numbers row by row, of a pose.
+// Return the matrix c2w, 16 numbers row by row, of a pose.
 export function cameraOf({ axes }, { target, distance, azimuth, elevation, roll }) {
   const [east, north, up] = axes;
   const along = add(east.map((v) => v * Math.cos(azimuth)), north, Math.sin(azimuth));
@@ -125,7 +128,7 @@ export function cameraOf({ axes }, { target, distance, azimuth, elevation, roll 
   return [...[0, 1, 2].flatMap((i) => [right[i], top[i], back[i], place[i]]), 0, 0, 0, 1];
 }
 
-// What a renderer draws of a pose in a window of `width` x `height` pixels: the whole angle of view fits in.
+// Return the renderer's view of a pose in a window of `width` x `height` pixels. The whole angle of view fits in.
 export function viewOf(frame, pose, width, height) {
   const { x, y, shiftX, shiftY, pixel } = pose.lens;
   const fx = Math.min(width / 2 / x, height / 2 / y / pixel);
@@ -137,7 +140,7 @@ export function viewOf(frame, pose, width, height) {
 
 // --- moves: each takes a pose and returns another ---
 
-// Roll goes away as a camera turns, so that a hand that turns it finds up to be up.
+// Return the roll after a turn. It decreases as the camera turns, so that a visitor who turns the scene soon finds it upright.
 const levelled = (roll, turned) => roll * Math.exp(-2 * turned);
 
 // Turn around the target, by angles in radians.
@@ -154,7 +157,7 @@ export function looked(frame, pose, left, up) {
   return { ...turned, target: add(turned.target, add(column(before, 3), column(after, 3), -1)) };
 }
 
-// Move camera and target together, by world units to the camera's right, to its top and ahead.
+// Move the camera and its target together, by world units to the right, to the top and ahead of the camera.
 export function moved(frame, pose, right, up, ahead) {
   const c2w = cameraOf(frame, pose);
   const way = add(add(column(c2w, 0).map((v) => v * right), column(c2w, 1), up), column(c2w, 2), -ahead);
@@ -166,7 +169,7 @@ export function zoomed(frame, pose, factor) {
   return { ...pose, distance: clamped(pose.distance * factor, frame.radius * 1e-3, frame.radius * 1e3) };
 }
 
-// Look from where the camera is at a point, and turn around that from now on.
+// Look at a point from where the camera is, and turn around that point from now on.
 export function aimed(frame, pose, point) {
   const place = column(cameraOf(frame, pose), 3), arm = add(place, point, -1);
   const distance = Math.hypot(...arm), back = unit(arm, column(cameraOf(frame, pose), 2));
@@ -175,14 +178,14 @@ export function aimed(frame, pose, point) {
   return { ...pose, target: point, distance, azimuth: Math.atan2(north, east), elevation };
 }
 
-// The point that is `t` along the ray through a place of a view, x and y in pixels from its upper left corner.
+// Return the point at distance `t` along the ray through (x, y) of a view, in pixels from its upper left corner.
 export function pointAt({ c2w, fx, fy, cx, cy }, x, y, t) {
   const [right, top, back, place] = [0, 1, 2, 3].map((i) => column(c2w, i));
   const direction = add(add(back.map((v) => -v), right, (x - cx) / fx), top, (cy - y) / fy);
   return add(place, unit(direction, back), t);
 }
 
-// The pose a share 0..1 of the way from one to another: around by the shorter way.
+// Interpolate between two poses, a share 0..1 of the way. Azimuth and roll go around by the shorter way.
 export function between(from, to, share) {
   const mix = (a, b) => a + (b - a) * share;
   const turn = (a, b) => a + Math.atan2(Math.sin(b - a), Math.cos(b - a)) * share;
@@ -196,7 +199,7 @@ export function between(from, to, share) {
   };
 }
 
-// How far apart two poses are: angles, and ways in units of the distance.
+// Return how far apart two poses are: the sum of differences of angles, relative distances, and logarithms of ratios.
 export function difference(a, b) {
   const angle = (from, to) => Math.abs(Math.atan2(Math.sin(to - from), Math.cos(to - from)));
   return Math.hypot(...add(a.target, b.target, -1)) / b.distance + Math.abs(Math.log(a.distance / b.distance))

@@ -1,10 +1,10 @@
-// Shaders put together for a scene, compiled when they are first needed.
+// Writes the shaders of a scene, from the texts of the .glsl files, and compiles them.
 import { featureWords, LINES_A_LAYER, MANY, NO_LEVEL, rowsALine } from "./grid.js";
 import { headCode } from "./head.js";
 import { shaders } from "./shaders.js";
 
 export const LAYERS = ["colour", "depth", "normals", "opacity", "middle"];
-const KEPT = 64; // samples of a ray that are kept for its fetches
+const KEPT = 64; // samples that are kept per ray: see fetches.glsl
 
 const VERTEX = `#version 300 es
 void main() {
@@ -12,7 +12,7 @@ void main() {
 }
 `;
 
-// Texts that stand for names in the shaders.
+// Return the texts that replace names in the shaders, which depend on the number of channels.
 function featureTexts(nChannels) {
   const n = featureWords(nChannels), numbers = Array.from({ length: n }, (_, i) => i);
   const nWords = 2 * n, nOut = foundTextures(nChannels);
@@ -33,7 +33,7 @@ function featureTexts(nChannels) {
   };
 }
 
-// Textures that the march writes for the head, of eight features each, beside one of opacity.
+// Number of textures, of eight features each, that the march writes for the head. One more has the opacity.
 export const foundTextures = (nChannels) => Math.ceil(nChannels / 8);
 
 const BEGIN = "#version 300 es\n";
@@ -43,7 +43,8 @@ function filled(text, texts) {
   return text.replace(new RegExp(`\\b(${Object.keys(texts).join("|")})\\b`, "g"), (name) => texts[name]);
 }
 
-// The fragment shader of a layer; of the colour, what the head is to know. `mostSteps`: base steps that a ray can have.
+// Return the fragment shader that marches rays and draws a layer; for "colour" it writes what the head needs instead.
+// `mostSteps`: the most base steps that a ray can have.
 export function marchSource(scene, { layer, counting, mostSteps }) {
   const { manifest } = scene, nChannels = manifest.n_channels;
   const defines = {
@@ -58,7 +59,7 @@ export function marchSource(scene, { layer, counting, mostSteps }) {
   return BEGIN + lines.join("") + PRECISION + filled(text, featureTexts(nChannels));
 }
 
-// The fragment shader of the head, and the numbers that it reads: { source, weights, table }.
+// Return the fragment shader of the head, and the numbers that the shader reads: { source, weights, table }.
 export function headSource(scene) {
   const { texts, weights, table } = headCode(scene.head);
   const text = filled(filled(shaders["head.glsl"], { ...featureTexts(scene.manifest.n_channels), ...texts }), texts);
@@ -67,11 +68,11 @@ export function headSource(scene) {
 
 export const compositeSource = () => BEGIN + PRECISION + shaders["composite.glsl"];
 
-// A program, which the driver compiles and links while other things are done.
+// A program. The constructor only starts compiling and linking, and the driver goes on in the background.
 export class Program {
   constructor(gl, fragment) {
     this.gl = gl;
-    this.uniforms = null; // the places of its uniforms, when it is linked
+    this.uniforms = null; // place and type of each uniform by name, once linked
     this.program = gl.createProgram();
     this.shaders = [[gl.VERTEX_SHADER, VERTEX], [gl.FRAGMENT_SHADER, fragment]].map(([kind, text]) => {
       const shader = gl.createShader(kind);
@@ -83,7 +84,7 @@ export class Program {
     gl.linkProgram(this.program);
   }
 
-  // Waits until it is linked; throws an Error with the driver's words.
+  // Wait until the program is linked. Throws an Error with the driver's message if it cannot be linked.
   link() {
     const { gl, program, shaders } = this;
     if (!gl.getProgramParameter(program, gl.LINK_STATUS) && !gl.isContextLost()) {
@@ -99,8 +100,8 @@ export class Program {
     }
   }
 
-  // `values`: numbers, arrays, booleans, or textures { texture, target } by the uniforms' names; those that the program
-  // does not have are left out.
+  // Make this the current program and set its uniforms. `values`: numbers, arrays, booleans, or textures { texture, target },
+  // by the uniforms' names; values for uniforms that the program does not have are ignored.
   use(values) {
     const { gl } = this;
     if (!this.uniforms) this.link();

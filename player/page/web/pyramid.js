@@ -1,5 +1,5 @@
-// A pyramid: the vertices of its levels, and the values that follow from symbols (docs/format.md, "Pyramids"). The twin
-// of player/asset/pyramid.py and player/asset/symbols.py.
+// A pyramid: the vertices of its levels, and how their values are computed from symbols (docs/format.md, "Pyramids"). The
+// twin of player/asset/pyramid.py and player/asset/symbols.py.
 
 import { Bricks, coordOf, keyOf, NO_BRICKS, popcount, Ranks } from "./bricks.js";
 
@@ -41,11 +41,12 @@ export class Pyramid {
     return new Vertices(corners, border);
   }
 
-  // Into `out` from `at` on, a byte a line of cells along z: which cells, in the place `key` of a brick of the next finer
-  // level, are read from live cells of `level` or coarser ones.
+  // Find which cells of a missing brick are read from live cells of `level` or coarser levels. `key` is the coordinate that
+  // the brick would have in the next finer level than `level`. A byte for each line of cells along z goes into `out`, from
+  // `at` on.
   putShown(level, key, out, at) {
     let [x, y, z] = coordOf(key);
-    let shift = 0; // how many levels coarser than the place
+    let shift = 0; // how many levels coarser the brick that is found is
     let brick = -1;
     const [firstX, firstY, firstZ] = [8 * x, 8 * y, 8 * z];
     for (; brick < 0; level++, shift++) {
@@ -54,7 +55,7 @@ export class Pyramid {
       brick = this.levels[level].find(x, y, z);
     }
     const { bytes } = this.levels[level - 1];
-    const bits = (1 << (8 >> shift || 1)) - 1; // of a line along z of cells: so many become 8
+    const bits = (1 << (8 >> shift || 1)) - 1; // for the cells of a line along z that become the 8 of the missing brick
     for (let line = 0; line < 64; line++) {
       const cellX = ((firstX + (line >> 3)) >> shift) & 7;
       const cellY = ((firstY + (line & 7)) >> shift) & 7;
@@ -65,10 +66,11 @@ export class Pyramid {
   }
 }
 
-// Four bits, each twice.
+// For each number of four bits: the number of eight bits in which each bit stands twice.
 const DOUBLED = Uint8Array.from({ length: 16 }, (_, bits) => [3, 12, 48, 192].reduce((all, pair, i) => all | (bits & (1 << i) ? pair : 0), 0));
 
-// The keys of all places with components from `low` to `high` beside those of bricks and from 0 to `end` - 1, sorted.
+// Return the sorted keys of all coordinates that differ from a brick's by `low` to `high` in each component, and whose
+// components are from 0 to `end` - 1.
 function neighbourhood(bricks, low, high, end) {
   const offsets = [];
   for (let x = low; x <= high; x++) {
@@ -87,13 +89,13 @@ function neighbourhood(bricks, low, high, end) {
   return sorted.filter((key, i) => i === 0 || key !== sorted[i - 1]);
 }
 
-// The corners of live cells, as masks of bricks of vertices.
+// Return the corners of live cells, as bricks of vertices.
 function cornersOf(cells) {
   const keys = neighbourhood(cells, 0, 1, 512);
   const masks = new Uint32Array(16 * keys.length);
   const { bytes } = cells;
   const found = new Uint8Array(masks.buffer);
-  const around = new Uint16Array(81); // cells at 9 x + y from -1 to 7, bit z + 1
+  const around = new Uint16Array(81); // lines of cells, x, y and z from -1 to 7: bit z + 1 at 9 (x + 1) + y + 1
   for (let i = 0; i < keys.length; i++) {
     const [x, y, z] = coordOf(keys[i]);
     around.fill(0);
@@ -119,8 +121,8 @@ function cornersOf(cells) {
   return new Bricks(keys, masks).withoutEmpty();
 }
 
-// The vertices of a level, in the order of their rows: `bricks` of vertices, `border` Uint32Array [16 n]: those of them
-// on the border.
+// The vertices of a level, in the order of their rows. `bricks`: bricks of vertices; `border` Uint32Array [16 n]: the masks
+// of those vertices that are on the border.
 export class Vertices {
   constructor(bricks, border) {
     this.bricks = bricks;
@@ -130,8 +132,9 @@ export class Vertices {
     this.nStored = this.n - border.reduce((sum, word) => sum + popcount(word), 0); // vertices that have symbols
   }
 
-  // What is known about the vertices that are not on the border before their symbols are: `neighbours` [alongZ, alongY,
-  // alongX] Int32Array [n], n for one that is not there, and `classes` Uint8Array [n]: how many coordinates are odd.
+  // Return the neighbours and classes of the vertices that are not on the border, which are needed to decode their symbols.
+  // `neighbours` [alongZ, alongY, alongX] Int32Array [n]: rows, n where there is none; `classes` Uint8Array [n]: how many
+  // coordinates are odd.
   rows() {
     const { bricks, border } = this;
     const stored = new Ranks(bricks, bricks.masks.map((word, i) => word & ~border[i]));
@@ -162,8 +165,9 @@ export class Vertices {
   }
 }
 
-// For each bit b of a brick: which of 5 x 5 x 5 vertices of the next coarser level are around it, at floor and ceil of
-// half its position; 1, 2, 4 or 8 different ones, the others are repeated.
+// For each bit b of a brick, the vertices from which the vertex there is predicted: indices into the 5 x 5 x 5 vertices of
+// the next coarser level around the brick, at floor and ceil of half its position. These are 1, 2, 4 or 8 different ones,
+// repeated until there are 8.
 const AROUND = new Uint8Array(512 * 8);
 for (let b = 0; b < 512; b++) {
   const [x, y, z] = [b >> 6, (b >> 3) & 7, b & 7];
@@ -175,13 +179,14 @@ for (let b = 0; b < 512; b++) {
     .forEach((place, k) => { AROUND[8 * b + k] = place; });
 }
 
-// The values of the channels from `first` on of a level, `clip(predicted + step * symbol)`, into `values`.
+// Compute the values of some channels of a level, `clip(predicted + step * symbol)`, into `values`.
 // - here, coarser: the vertices of the level, and of the next coarser one (null for the coarsest);
 // - values, coarserValues: typed arrays, rows of `stride`;
-// - n: how many channels;
+// - first, n: the first channel, and the number of channels;
 // - symbols: Uint8Array [n * nStored], channel by channel, symbols + 63;
-// - beyond: for channels, `first` the first, { bytes, first }: how much further symbols of -63 and 63 are, from first on;
-// - step, low, high: of the level, and of values.
+// - beyond: for each of these channels, as far as it has symbols of -63 or 63, { bytes, first }: how much further from 0
+//   these symbols are, from number `first` of `bytes` on;
+// - step: the level's step; low, high: the least and the greatest value.
 export function putValues({ here, coarser, values, coarserValues, stride, first, n, symbols, beyond, step, low, high }) {
   const { bricks: { keys, masks }, border, nStored } = here;
   const beyondAt = Int32Array.from(beyond, (channel) => channel.first);
@@ -217,8 +222,8 @@ export function putValues({ here, coarser, values, coarserValues, stride, first,
   }
 }
 
-// For each of 5 x 5 x 5 places around an octant that begins at (4 x, 4 y, 4 z), its bit in the one of eight bricks that
-// it is in, and 512 times the number of that.
+// For each octant, 0 to 7, of a brick, and each of the 5 x 5 x 5 vertices around the octant: the vertex's bit in its brick,
+// plus 512 times the number of that brick, 0 to 7, among the octant's brick and its neighbours along +x, +y and +z.
 const PLACES = Uint16Array.from({ length: 8 * 125 }, (_, i) => {
   const [octant, place] = [Math.floor(i / 125), i % 125];
   const x = 4 * (octant >> 2) + Math.floor(place / 25);
@@ -228,7 +233,7 @@ const PLACES = Uint16Array.from({ length: 8 * 125 }, (_, i) => {
 });
 const found = new Int32Array(8);
 
-// The coarser level's values at 5 x 5 x 5 vertices around a brick of vertices, into `near` [125 n].
+// Copy the coarser level's values at the 5 x 5 x 5 vertices around a brick of vertices into `near` [125 n].
 function gather(coarser, key, values, stride, first, n, near) {
   const [x, y, z] = coordOf(key);
   for (let k = 0; k < 8; k++) {
@@ -238,12 +243,12 @@ function gather(coarser, key, values, stride, first, n, near) {
   for (let place = 0; place < 125; place++) {
     const at = PLACES[octant + place];
     const from = coarser.ranks.at(found[at >> 9], at & 511, -1);
-    if (from < 0) continue; // around no vertex that is there
+    if (from < 0) continue; // absent: no vertex of the brick is predicted from it
     for (let k = 0; k < n; k++) near[place * n + k] = values[from * stride + first + k];
   }
 }
 
-// The mean of eight of `near`, rounded.
+// Predict the values of the vertex at bit b, [n]: the rounded mean of the vertices around it in `near`.
 function predict(near, b, n, predicted) {
   const at = 8 * b;
   const nOdd = (b & 1) + ((b >> 3) & 1) + ((b >> 6) & 1);

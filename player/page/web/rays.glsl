@@ -1,9 +1,10 @@
-// The rays of pixels: see camera.js.
+// Computes the rays of pixels: see camera.js.
 
 uniform vec3 uCentre, uAcross, uDown;
 uniform vec2 uPixel, uRows, uTile;
 
-// The direction of the ray through a place in the tile that is drawn, and how far it is turned from uCentre.
+// Return the unit direction of the ray through a place in the tile that is drawn, and set turnedBy to how far it differs
+// from uCentre.
 vec3 turnedBy;
 vec3 directionOf(vec2 place) {
   place += uTile;

@@ -1,10 +1,11 @@
-// Draws a scene with WebGL2, to its canvas or into a picture.
+// Draws a scene with WebGL2, to its canvas or into an array of bytes.
 //
 // A view is { c2w: [16], row-major, OpenGL axes, world frame, fx, fy, cx, cy, width, height, quality: "exact" | "high" |
 // "fast", background: [r, g, b] | "transparent", layer: "colour" | "depth" | "normals" | "opacity", jitter: [dx, dy],
-// accumulate }. `background` is the manifest's if it is left out, `quality` is "high"; `jitter` moves the rays by parts of
-// a pixel; with `accumulate` the canvas shows the mean of the pictures drawn since the last one without it. `n_fetches`
-// overrides the quality's, 0 for all samples.
+// accumulate, n_fetches }. By default `background` is the manifest's, `quality` is "high" ("exact" for `render`), and
+// `layer` is "colour". `jitter` shifts the rays by fractions of a pixel. With `accumulate` the canvas shows the mean of
+// the pictures drawn since the last one without it. `n_fetches` replaces the quality's feature lookups per ray; 0 looks
+// features up at every sample.
 import { raysOf } from "./camera.js";
 import { NO_GRID } from "./grid.js";
 import { multiplyAdds } from "./head.js";
@@ -29,8 +30,8 @@ void main() {
 `;
 
 export class Renderer {
-  // A renderer of a scene, whose grid may be null: its shaders are compiled meanwhile. Throws an Error whose message says
-  // what is missing. Waits where the context is lost, until it is back.
+  // Make a renderer of a scene. The scene's grid may still be null: its shaders are compiled meanwhile. Rejects with an Error
+  // whose message says what is missing. If the context is lost, this waits until it is back.
   static async create(canvas, scene) {
     const renderer = new Renderer(canvas, scene);
     for (;;) {
@@ -51,7 +52,7 @@ export class Renderer {
     if (!gl) throw new Error("WebGL2: expected a browser that has it switched on, got none");
     Object.assign(this, { canvas, gl, scene, onrestored: null });
     this.listeners = {
-      webglcontextlost: (event) => event.preventDefault(), // else it would not come back
+      webglcontextlost: (event) => event.preventDefault(), // otherwise the context would not come back
       webglcontextrestored: () => {
         this.setUp();
         this.onrestored?.();
@@ -75,15 +76,15 @@ export class Renderer {
   }
 
   setUp() {
-    if (this.lost) return; // it is done when the context is back
+    if (this.lost) return; // called again when the context is back
     const { gl } = this;
     const debug = gl.getExtension("WEBGL_debug_renderer_info");
     this.name = String(gl.getParameter(debug ? debug.UNMASKED_RENDERER_WEBGL : gl.RENDERER));
     this.sums = gl.getExtension("EXT_color_buffer_float") ?? gl.getExtension("EXT_color_buffer_half_float");
     this.sum = null;
     this.nSummed = 0;
-    this.programs = new Map(); // by their sources
-    this.layers = new Map(); // programs by what they draw
+    this.programs = new Map(); // by source
+    this.layers = new Map(); // programs by layer, and whether they count fetches
     const { manifest } = this.scene, { source, weights, table } = headSource(this.scene);
     const diagonal = Math.hypot(...manifest.aabb[0].map((x, i) => manifest.aabb[1][i] - x));
     this.mostSteps = Math.floor((manifest.contracted ? Math.PI : diagonal) / manifest.step) + 3;
@@ -96,11 +97,12 @@ export class Renderer {
     this.show(this.scene);
   }
 
-  // Drivers finish a shader when something is drawn with it: one pixel of what is shown so far, to both places.
+  // Draw one pixel of the current scene, into a picture and to the canvas: drivers finish compiling a shader only when
+  // something is drawn with it.
   async warmUp() {
     const c2w = [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1];
     const view = { c2w, fx: 1, fy: 1, cx: 0.5, cy: 0.5, width: 1, height: 1 };
-    await this.done(); // the page is not held up while they are compiled
+    await this.done(); // does not block the page while shaders are compiled
     await this.read(view);
     this.paint(view, null, { upwards: true, premultiplied: true });
     await this.done();
@@ -115,11 +117,11 @@ export class Renderer {
     if (scene.grid) checkMemory(gl, "this scene");
   }
 
-  // Shows a finer scene from now on. Where it does not fit, throws an Error, and shows the one before again.
+  // Show a finer scene from now on. If it does not fit into memory, shows the previous one again and throws an Error.
   replace(scene) {
     const before = this.scene;
     this.scene = scene;
-    if (this.lost) return; // it is shown when the context is back
+    if (this.lost) return; // setUp shows it when the context is back
     this.forget();
     this.nSummed = 0;
     try {
@@ -136,7 +138,8 @@ export class Renderer {
     for (const { texture } of Object.values(this.textures)) gl.deleteTexture(texture);
   }
 
-  // What lies between the passes of a tile: what the march has found, and the head's colours of 2 x 2 pixels a texel.
+  // Make the framebuffers between the passes of a tile: `found` for what the march has found in each pixel, and `colours` for
+  // the head's colours, 2 x 2 pixels per texel.
   makeTile(nChannels) {
     const { gl } = this, n = foundTextures(nChannels), most = gl.getParameter(gl.MAX_DRAW_BUFFERS);
     if (n + 1 > most) throw new Error(`WebGL2: expected ${n + 1} draw buffers for ${nChannels} channels, got ${most}`);
@@ -173,19 +176,22 @@ export class Renderer {
     return this.programs.get(source);
   }
 
-  // The number of fetches and the steps of a quality. Measured loss against photographs, of lego and fox: `high` 0.02 and
-  // 0.00 dB, `fast` 0.19 and 0.05; a base step twice as long would cost lego, whose steps are three cells long, 2.9 dB.
+  // Return the feature lookups per ray and the base steps per sample of a view's quality. Lookups are limited as the bake
+  // found; where it found no limit, measured losses against photographs, for lego and fox, are 0.02 and 0.00 dB for `high`,
+  // and 0.19 and 0.05 dB for `fast`. Samples twice as long would cost lego, whose base steps are three cells long, 2.9 dB;
+  // so `fast` has them only if a base step is at most one cell long.
   quality(view) {
     const { manifest } = this.scene, { n_fetches: k, level_steps: steps } = manifest;
-    const fetches = { exact: k, high: Math.ceil((7 * k) / 8), fast: Math.ceil(k / 2) }[view.quality ?? "high"];
+    const [high, fast] = manifest.quality_fetches ?? [0, 0]; // 0 where the bake has set no limit
+    const fetches = { exact: k, high: high || Math.ceil((7 * k) / 8), fast: fast || Math.ceil(k / 2) }[view.quality ?? "high"];
     const cells = Math.max(...this.constant.uCellsPerUnit) * manifest.step;
     const coarser = view.quality === "fast" && cells <= 1 ? 2 : 1;
     const uLevelSteps = Array.from({ length: 8 }, (_, level) => (steps[level] ?? 1) * coarser);
     return { uFetches: view.n_fetches ?? fetches, uLevelSteps, uLongestStep: Math.max(...uLevelSteps) };
   }
 
-  // Draws a view into a framebuffer, null for the canvas; `upwards` if its first row is the picture's last. Only what is
-  // in `part`, [left, top, width, height].
+  // Draw a part of a view, [left, top, width, height], into a framebuffer; null is the canvas. `upwards`: the framebuffer's
+  // first row is the picture's last. `counting`: draw the numbers of texture fetches. `summed`: add to what is there.
   paint(view, target, { upwards, premultiplied, counting = false, summed = false, part = [0, 0, view.width, view.height] }) {
     const { gl } = this, { manifest } = this.scene, layer = view.layer ?? "colour";
     const behind = view.background ?? manifest.background;
@@ -228,7 +234,7 @@ export class Renderer {
   draw(view) {
     const { gl } = this;
     if (this.lost) return;
-    this.drawn = view.quality ?? "high"; // what `info` tells
+    this.drawn = view.quality ?? "high"; // info tells it
     if (!view.accumulate || !this.sums || (view.layer ?? "colour") !== "colour") {
       this.nSummed = 0;
       this.paint(view, null, { upwards: true, premultiplied: true });
@@ -250,7 +256,8 @@ export class Renderer {
     gl.drawArrays(gl.TRIANGLES, 0, 3);
   }
 
-  // The bytes [4 n] of a part of a view, [left, top, width, height] of it, top row first, straight alpha.
+  // Return the bytes [4 n] of a part of a view, [left, top, width, height] in pixels: RGBA, the top row first, colours not
+  // multiplied by alpha.
   async read(view, part = [0, 0, view.width, view.height], counting = false) {
     const { gl } = this;
     if (this.lost) throw new Error(LOST);
@@ -263,14 +270,14 @@ export class Renderer {
       gl.bindBuffer(gl.PIXEL_PACK_BUFFER, buffer);
       gl.getBufferSubData(gl.PIXEL_PACK_BUFFER, 0, bytes);
       gl.bindBuffer(gl.PIXEL_PACK_BUFFER, null);
-      checkMemory(gl, pictureOf(view)); // some drivers take the memory late
+      checkMemory(gl, pictureOf(view)); // some drivers take memory only when they draw
     } finally {
       gl.deleteBuffer(buffer);
     }
     return new Uint8ClampedArray(bytes.buffer);
   }
 
-  // Draws a part of a view, and has its bytes copied to a buffer.
+  // Draw a part of a view, and start copying its bytes to a pixel buffer.
   paintTo(buffer, length, view, part, counting) {
     const { gl } = this, target = framebufferOf(gl, view.width, view.height, [gl.RGBA8]);
     try {
@@ -287,14 +294,14 @@ export class Renderer {
     }
   }
 
-  // Waits until the GPU has done what it was told, without holding up the page.
+  // Wait until the GPU has finished all commands so far, without blocking the page.
   async done() {
     const { gl } = this, fence = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
     gl.flush();
     for (;;) {
       if (this.lost) throw new Error(LOST);
       const state = gl.clientWaitSync(fence, 0, 0);
-      if (state === gl.WAIT_FAILED) throw new Error(LOST); // the fence was lost, and the context is back
+      if (state === gl.WAIT_FAILED) throw new Error(LOST); // the fence was lost with a context that has come back
       if (state === gl.ALREADY_SIGNALED || state === gl.CONDITION_SATISFIED) break;
       await new Promise((resolve) => setTimeout(resolve, 2));
     }
@@ -305,7 +312,8 @@ export class Renderer {
     return { width: view.width, height: view.height, rgba: await this.read({ quality: "exact", ...view }) };
   }
 
-  // t along the ray of the pixel (x, y), in scene units, where half of its opacity is reached; null if nothing is there.
+  // Return t along the ray of the pixel (x, y), in world units, where half of the ray's opacity is reached; null if nothing
+  // is there.
   async depthAt(view, x, y) {
     const at = [Math.floor(x), Math.floor(y), 1, 1];
     const bytes = await this.read({ ...view, layer: "middle" }, at);
@@ -313,7 +321,8 @@ export class Renderer {
     return depth > 0 ? depth : null;
   }
 
-  // Texture fetches of each pixel of a view, and how many pixels run the head: { fetches: Uint32Array, nHits }.
+  // Count the march's texture fetches for each pixel of a view, and the pixels for which the head runs: { fetches:
+  // Uint32Array, nHits }.
   async count(view) {
     const words = new Uint32Array((await this.read({ ...view, background: "transparent" }, undefined, true)).buffer);
     return { fetches: words.map((word) => word & 0xffffff), nHits: words.reduce((sum, word) => sum + (word >>> 24), 0) };

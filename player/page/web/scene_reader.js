@@ -1,12 +1,12 @@
-// What decodes a scene, in workers or in the page: files of the data are compared with the manifest, parts become
-// densities and features, and these the arrays of grid.js.
+// Decodes a scene, in workers or in the page: checks the files of the data against the manifest, decodes the parts to
+// densities and features, and arranges these as the arrays of grid.js.
 
 import { arrangeDensities, arrangeFeatures } from "./grid.js";
 import { PartsReader } from "./parts.js";
 import { bytesOf } from "./text_bytes.js";
 
-// The bytes of a file of the data that is { text }, as the page has it, or { bytes }, as a server does. Rejects with an
-// Error if it is not the one of the manifest's `entry` { bytes, sha256 }.
+// Return the bytes of a file of the data, given as { text } if the page holds it, or as { bytes } if a server sent it.
+// Rejects with an Error if the file is not the one that the manifest's `entry` { bytes, sha256 } describes.
 export async function checkedFile(name, { text, bytes }, entry) {
   const data = bytes ?? bytesOf(text, entry.bytes);
   if (!data || data.length !== entry.bytes) {
@@ -22,19 +22,19 @@ export async function checkedFile(name, { text, bytes }, entry) {
 }
 
 export class SceneReader {
-  // `grids`: which of "densities" and "features" it is to read; `pause` is awaited now and then: where other work is to
-  // be done between.
+  // `grids`: which of "densities" and "features" to read; `pause`: an async function that is awaited now and then, so that
+  // other work can be done in between.
   constructor(manifest, grids, pause) {
     if (!globalThis.DecompressionStream) throw new Error("expected a browser with DecompressionStream, got an older one");
     this.manifest = manifest;
     this.pause = pause;
     this.parts = new PartsReader(manifest, grids);
-    this.last = Promise.resolve(); // what was asked for last
-    this.isWhole = true; // whether a part was not begun to be read that is broken
+    this.last = Promise.resolve(); // the call that was made last
+    this.isWhole = true; // false while a part is decoded, and for good if that fails
   }
 
-  // Reads the next part, { text } or { bytes }; `onProgress` is told of bytes. Rejects with an Error: the scene is then
-  // that of the parts before, unless `isWhole` has become false. Calls may be made before the last one is done.
+  // Read the next part, { text } or { bytes }; `onProgress` is called with numbers of bytes. If this rejects with an Error, the
+  // scene is still that of the parts before, unless `isWhole` has become false. Calls may be made before the last one is done.
   read(file, onProgress) {
     return this.next(async () => {
       const { file: name } = this.manifest.parts[this.parts.nRead];
@@ -45,7 +45,7 @@ export class SceneReader {
     });
   }
 
-  // The arrays of its grids, as far as they are read.
+  // Return the arrays of grid.js for the grids, as far as they have been read. `isLast`: see PartsReader.
   grid(isLast) {
     return this.next(() => {
       const { densities, features } = this.parts.values(isLast);

@@ -10,16 +10,16 @@ const MUST = 49;
 const DEAD = 0;
 const LIVE = 1;
 const UNKNOWN = 2;
-const COUNT = Uint8Array.of(1, 7, 0); // of a dead, a live and an unknown neighbour
+const COUNT = Uint8Array.of(1, 7, 0); // added to a class by a dead, a live and an unknown neighbour
 
-// The bricks of a level.
-// - data: the bytes of its section;
-// - cellsPerAxis: those of the level;
+// Decode the bricks of a level.
+// - data: the bytes of the level's section;
+// - cellsPerAxis: the level's cells along each axis;
 // - parent: the bricks of the next coarser level; null for the coarsest;
 // - nBricks: how many bricks the level has;
-// - where: the section's name in messages.
-// Rejects with an Error if the data break the format, or have another number of bricks. Memory is bounded by the bricks
-// of the two levels and the length of `data`.
+// - where: the section's name in error messages.
+// Rejects with an Error if the data break the format, or hold another number of bricks. Memory is bounded by the numbers
+// of bricks of the two levels and the length of `data`.
 export async function decodeStructure(data, cellsPerAxis, parent, nBricks, where) {
   const nAbove = 32 - Math.clz32(cellsPerAxis - 1);
   const pieces = piecesOf(data, parent ? 2 : nAbove, where);
@@ -43,7 +43,7 @@ export async function decodeStructure(data, cellsPerAxis, parent, nBricks, where
   return bricks;
 }
 
-// Pieces of bytes, each behind its length.
+// Split `data` into n pieces, each preceded by its length in bytes, uint32.
 function piecesOf(data, n, where) {
   const view = new DataView(data.buffer, data.byteOffset, data.length);
   const pieces = [];
@@ -59,7 +59,7 @@ function piecesOf(data, n, where) {
 }
 
 function checkInside({ keys, masks }, cellsPerAxis, where) {
-  const nWhole = cellsPerAxis >> 3; // bricks along an axis that are all inside
+  const nWhole = cellsPerAxis >> 3; // bricks along an axis that lie entirely inside the grid
   for (let i = 0; i < keys.length; i++) {
     const [x, y, z] = coordOf(keys[i]);
     if (x < nWhole && y < nWhole && z < nWhole) continue;
@@ -73,8 +73,9 @@ function checkInside({ keys, masks }, cellsPerAxis, where) {
   }
 }
 
-// The octants with live cells: `named` finds them by the coordinates of bricks of the next finer level, `live`
-// Uint16Array [4 n] has their cells: bit 4 y + z of number x.
+// Find the octants that have live cells. An octant is 4 x 4 x 4 cells of a brick, the place of one brick of the next finer
+// level. `named` finds octants by the coordinates of these finer bricks; `live` Uint16Array [4 n] has their cells: bit
+// 4 y + z of number x of an octant.
 function octantsOf(bricks) {
   const nibbles = (brick, octant, x) => {
     const word = bricks.masks[16 * brick + 2 * (4 * (octant >> 2) + x) + ((octant >> 1) & 1)] >>> (4 * (octant & 1));
@@ -100,7 +101,8 @@ function octantsOf(bricks) {
   return { named, live };
 }
 
-// The octants beside each, along an axis (0 is x) on a side (-1 or 1): Int32Array [n], n for one that is not there.
+// Return the number of the octant beside each octant, along an axis (0 is x) on a side (-1 or 1): Int32Array [n], n where
+// there is none.
 function octantsBeside(named, axis, side) {
   const found = new Int32Array(named.n);
   const step = [0, 0, 0];
@@ -123,7 +125,7 @@ async function decodeOctants(data, octants, where) {
   return asBits(found, `${where}: bricks`);
 }
 
-// Symbols + 63 that are 0 or 1, as these.
+// Turn symbols + 63 into symbols, in place. Throws an Error unless all of them are 0 or 1.
 function asBits(found, where) {
   for (let i = 0; i < found.length; i++) {
     found[i] -= SYMBOL_OF_ZERO;
@@ -132,9 +134,9 @@ function asBits(found, where) {
   return found;
 }
 
-// The live cells of octants that are refined. `local` Uint8Array [n]: 16 x + 4 y + z in the octant; `octant` Int32Array
-// [n]: its number; `beside` [axis][before or after] Int32Array [n]: the rows beside each; n for a cell that is
-// not live, n + 1 for one in an octant that is not refined.
+// Find the parents, which are the live cells of refined octants. `local` Uint8Array [n]: 16 x + 4 y + z of each in its
+// octant; `octant` Int32Array [n]: the octant's number; `beside` [axis][before or after] Int32Array [n]: the row of the cell
+// beside each parent, n for a cell that is not live, n + 1 for a live one in an octant that is not refined.
 function parentsOf(octants, refined) {
   const { named } = octants;
   const { rows, n } = rowsOfCells(octants, refined);
@@ -146,8 +148,9 @@ function parentsOf(octants, refined) {
   return { octant, local, beside, n };
 }
 
-// The row of each cell of each octant, and of one more octant that is not there: -1 for a cell that is not live, -2 for one in
-// an octant that is not refined; and how many rows there are.
+// Number the parents: { rows, n }. `rows` has the row of each cell of each octant, -1 for a cell that is not live, and -2
+// for a live cell in an octant that is not refined. The cells of one more octant, which stands for missing ones, are all
+// -1. `n` is the number of rows.
 function rowsOfCells({ named, live }, refined) {
   const rows = new Int32Array(64 * (named.n + 1)).fill(-1, 64 * named.n);
   let n = 0;
@@ -169,7 +172,8 @@ function placesOfRows(rows, octant, local) {
   }
 }
 
-// The rows beside each: `others` are the octants beside each octant, `stride` is that of the axis.
+// Return the rows of the cells beside the parents, on a side along an axis. `others`: the octants beside the octants there;
+// `stride`: how much `local` changes from cell to cell along the axis.
 function rowsBeside(rows, octant, local, others, stride, side) {
   const n = octant.length;
   const found = new Int32Array(n);
@@ -224,7 +228,7 @@ function addBits(bits, more) {
   for (let i = 0; i < bits.length; i++) bits[i] |= more[i];
 }
 
-// The refined octants as bricks of the finer level.
+// Return the bricks of the finer level, one for each refined octant.
 function childBricks(octants, refined, parents, known) {
   const keys = octants.named.keys.filter((_, i) => refined[i]);
   const masks = new Uint32Array(16 * keys.length);

@@ -1,4 +1,4 @@
-// Bytes out of the text of a page: seven characters for six bytes. The twin of player/page/text_bytes.py.
+// Decodes bytes from the text of a page: seven characters stand for six bytes. The twin of player/page/text_bytes.py.
 
 const LEFT_OUT = "\0\n\r\v\f\x1a\x1b\"&'<\x7f";
 const N_BYTES = 6;
@@ -9,7 +9,8 @@ for (let code = 0; code < 128; code++) if (!LEFT_OUT.includes(String.fromCharCod
 
 const HALF = 116 ** 4;
 
-// The first `length` bytes of what the text holds; null if it holds fewer, or other characters.
+// Return the `length` bytes that a text encodes; null if the text has another length, or characters that are not in the
+// alphabet.
 export function bytesOf(text, length) {
   const nGroups = Math.ceil(length / N_BYTES);
   if (text.length !== nGroups * N_CHARACTERS) return null;
@@ -20,13 +21,13 @@ export function bytesOf(text, length) {
   return bytes.subarray(0, length);
 }
 
-// The digit of a character; negative if it is none of the alphabet.
+// Return the digit of a character; negative if the character is not in the alphabet.
 function digitAt(text, at) {
   const code = text.charCodeAt(at);
   return code < 128 ? DIGIT[code] : -1;
 }
 
-// Six bytes out of seven characters; whether these are of the alphabet.
+// Decode seven characters to six bytes; return whether all of them are in the alphabet.
 function putGroup(text, from, bytes, to) {
   const a = digitAt(text, from), b = digitAt(text, from + 1), c = digitAt(text, from + 2), d = digitAt(text, from + 3);
   const e = digitAt(text, from + 4), f = digitAt(text, from + 5), g = digitAt(text, from + 6);

@@ -1,5 +1,5 @@
-// The grids in textures: see grid.js. Shifts cost as much as fetches where the shader runs on a processor, so that places are
-// found by products and differences.
+// Reads the textures of the grids: see grid.js. Places are computed by products and differences instead of shifts, which
+// cost as much as fetches where the shader runs on a CPU.
 
 uniform highp usampler3D uTable;
 uniform highp sampler3D uDensity;
@@ -35,7 +35,7 @@ uvec4 columnsAt(ivec3 at) {
   return texelFetch(uColumns, at, 0);
 }
 
-// Where the first texel of a row of features is.
+// Return the position of the first texel of a row of features.
 ivec3 texelOfRow(int row) {
   int line = int(float(row) * (1.0 / float(ROWS_A_LINE))), layer = int(float(line) * (1.0 / float(LINES_A_LAYER)));
   return ivec3((row & (ROWS_A_LINE - 1)) * WORDS, line & (LINES_A_LAYER - 1), layer);

@@ -1,12 +1,12 @@
-// The arrays of a grid as textures of WebGL2.
+// Uploads the arrays of a grid as WebGL2 textures, and makes the framebuffers that are drawn to.
 import { blockOf, COLUMN_BRICK, DENSITY_BRICK, featureWords, LINES_A_LAYER, rowsALine } from "./grid.js";
 
-const MOST_LAYERS = 256; // that every device has
-const MOST_ROWS = 2 ** 24; // that a shader can tell apart: see textures.glsl
+const MOST_LAYERS = 256; // layers of an array texture that every device has
+const MOST_ROWS = 2 ** 24; // rows that textures.glsl can tell apart: it converts their numbers to float32
 
-export const TILE = 256; // pixels along a side of what is drawn at a time, so that no driver takes it for hung
+export const TILE = 256; // pixels along a side of a tile, drawn at a time, so that no driver takes the GPU for hung
 
-// Size [3] of the texture of n rows of features, texels.
+// Return the size [3] in texels of the texture of n rows of features. Throws an Error if no texture holds them.
 function featureSize(n, nChannels) {
   const lines = Math.max(Math.ceil(n / rowsALine(nChannels)), 1), layers = Math.ceil(lines / LINES_A_LAYER);
   if (n > MOST_ROWS || layers > MOST_LAYERS) throw new Error(`memory of the GPU: expected at most ${MOST_ROWS} rows of features, got ${n}`);
@@ -15,7 +15,8 @@ function featureSize(n, nChannels) {
 
 const product = (numbers) => numbers.reduce((all, number) => all * number, 1);
 
-// Bytes of a grid's textures, and of what a tile of the picture takes. The twin of player/page/gpu_memory.py.
+// Return the bytes of a grid's textures and of the framebuffers of a tile. The twin of `gpu_bytes` in
+// player/page/gpu_memory.py.
 export function gpuBytes({ nb, nf, density, columns, nRows }, nChannels) {
   const tile = TILE * TILE * (16 * Math.ceil(nChannels / 8) + 8 + 4);
   return 4 * (nb ** 3 + nf ** 3) + density.byteLength + columns.byteLength + 4 * product(featureSize(nRows, nChannels)) + tile;
@@ -32,19 +33,19 @@ export function uploadGrid(gl, { nb, nf, nSlots, nHeld, nRows, ...grid }, nChann
     uColumns: [TEXTURE_3D, columns, [gl.RGBA32UI, gl.RGBA_INTEGER, gl.UNSIGNED_INT], grid.columns],
     uFeatures: [TEXTURE_2D_ARRAY, features, [gl.RGBA8_SNORM, gl.RGBA, gl.BYTE], grid.features],
   };
-  for (const [target, size] of Object.values(made)) checkSize(gl, target, size); // before any takes memory
+  for (const [target, size] of Object.values(made)) checkSize(gl, target, size); // before any texture takes memory
   return Object.fromEntries(Object.entries(made).map(([name, given]) => [name, texture3D(gl, ...given)]));
 }
 
 function checkSize(gl, target, [width, height, depth]) {
   const most = gl.getParameter(target === gl.TEXTURE_3D ? gl.MAX_3D_TEXTURE_SIZE : gl.MAX_TEXTURE_SIZE);
   const largest = Math.max(width, height, target === gl.TEXTURE_3D ? depth : 0);
-  if (most === null || largest <= most) return; // null where the context is lost
+  if (most === null || largest <= most) return; // most is null if the context is lost
   throw new Error(`memory of the GPU: expected textures of ${largest} texels a side, got at most ${most}`);
 }
 
-// Throws an Error where memory of the GPU was too little for `what`: it has run out since this was called
-// last, or the bound framebuffer is not whole.
+// Throw an Error if the GPU's memory was too small for `what`: if it has run out since the last call, or if the
+// bound framebuffer is incomplete.
 export function checkMemory(gl, what) {
   const errors = [];
   for (let error = gl.getError(); error !== gl.NO_ERROR; error = gl.getError()) errors.push(error);
@@ -61,7 +62,8 @@ function fresh(gl, target) {
   return { texture, target };
 }
 
-// A texture of some size [3], formats [inside, format, type], filled with `values` line by line as far as these go.
+// Make a texture of a size [3] with the formats [internal format, format, type]. It is filled with `values` line by line,
+// as far as they reach.
 function texture3D(gl, target, [width, height, depth], [inside, format, type], values) {
   const found = fresh(gl, target), line = 4 * width;
   gl.texStorage3D(target, 1, inside, width, height, depth);
@@ -75,7 +77,7 @@ function texture3D(gl, target, [width, height, depth], [inside, format, type], v
   return found;
 }
 
-// s, its cosine and its sine at every half base step, as the march of contracted space reads them.
+// Upload the lattice that contracted.glsl reads: s, cos(s) and sin(s) at each of n half base steps.
 export function uploadLattice(gl, step) {
   const single = Math.fround(step), n = 2 * Math.floor(Math.PI / step) + 4, values = new Float32Array(4 * n);
   for (let i = 0; i < n; i++) {
@@ -85,7 +87,7 @@ export function uploadLattice(gl, step) {
   return { ...uploadFloats(gl, values), n };
 }
 
-// Texels of four numbers [4 n], in rows of 1024.
+// Upload numbers [4 n] as a texture of four float32 per texel, in rows of 1024 texels.
 export function uploadFloats(gl, values) {
   const height = Math.ceil(values.length / 4096), padded = new Float32Array(4096 * height);
   padded.set(values);
@@ -95,7 +97,7 @@ export function uploadFloats(gl, values) {
   return found;
 }
 
-// A framebuffer with textures of such formats, bound: { framebuffer, textures, width, height }.
+// Make a framebuffer with a texture of each format, and bind it: { framebuffer, textures, width, height }.
 export function framebufferOf(gl, width, height, formats) {
   gl.activeTexture(gl.TEXTURE0);
   const textures = formats.map((format) => {

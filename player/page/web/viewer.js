@@ -1,22 +1,22 @@
-// What is on the screen: the pose of the camera, how it moves, and which picture is drawn when.
+// Controls what is on the screen: the pose of the camera, how it moves, and which picture is drawn when.
 //
-// The camera follows a goal, which controls change; a flight leads it there on a way of its own. While it moves, pictures
-// are as small as 30 a second need. When it stands still there is a picture that takes some tenths of a second, then the
-// whole one, and then more of these, each a part of a pixel aside, which the renderer adds up. Then nothing is drawn until
-// something changes. Never is a picture begun before the last one is finished.
+// The camera follows a goal, a pose that controls change, or flies to the goal along a path of its own. While it moves,
+// pictures are small enough for 30 a second. Once it stands still, a picture follows that takes some tenths of a second,
+// then one at full size, and then more of these, each shifted by a fraction of a pixel, of which the renderer shows the
+// mean. Then nothing is drawn until something changes. No picture is begun before the last one is finished.
 
 import { aimed, between, difference, orbited, pointAt, poseOf, restOf, viewOf } from "./pose.js";
 import { Pace } from "./pace.js";
 
-const STILL_SECONDS = 0.15; // without a move, after which the camera stands still
-const EASE_SECONDS = 0.07; // in which the camera goes most of the way to its goal
+const STILL_SECONDS = 0.15; // without a move, after which the camera counts as still
+const EASE_SECONDS = 0.07; // in which the camera goes most of the way to the goal
 const FLIGHT_SECONDS = 1.2;
 const TURN_SPEED = 0.12; // radians a second
-const REST_SECONDS = 6; // untouched, after which a scene that is to turn turns again
-const N_WHOLE = 8; // whole pictures that are added up
-const FEW_SECONDS = 1; // pictures that take longer are not added up
+const REST_SECONDS = 6; // without a touch, after which the slow turn begins again, if asked for
+const N_WHOLE = 8; // pictures at full size, of which the mean is shown
+const FEW_SECONDS = 1; // if a picture takes longer, no further ones are drawn for the mean
 
-// The n-th number of a sequence that fills 0..1 evenly (van der Corput's, for a base).
+// Return the n-th number of van der Corput's sequence for a base, which fills 0..1 evenly.
 function spread(n, base) {
   let value = 0;
   for (let part = 1 / base; n > 0; n = Math.floor(n / base), part /= base) value += (n % base) * part;
@@ -35,8 +35,8 @@ export class Viewer {
     this.rest = pose;
     this.views = cameras.map((camera) => poseOf(frame, camera, pose.target));
     this.pose = this.goal = this.views[options.view] ?? pose;
-    this.flight = null; // { from, begin } where one is under way
-    this.step = () => false; // what moves the goal as time goes by: (seconds) => whether it did
+    this.flight = null; // { from, begin } while a flight is under way
+    this.step = () => false; // moves the goal as time passes: (seconds) => whether it did
     this.onturn = this.onview = () => {};
     this.again = options.turn === true && !calm;
     this.turning = !calm && (options.turn ?? options.view === undefined);
@@ -44,7 +44,7 @@ export class Viewer {
     this.background = options.background ?? background;
     this.layer = "colour";
     this.pace = new Pace();
-    this.covered = this.pose === pose; // whether the poster, which shows this pose, stays until the scene is all there
+    this.covered = this.pose === pose; // the poster, which shows this pose, stays until all of the scene is there
     this.touchedAt = this.before = performance.now();
     this.asked = 0; // the request for the next tick
     this.fence = null; // { sync, begin, moving } of the picture that is being drawn
@@ -52,10 +52,10 @@ export class Viewer {
     this.refresh();
   }
 
-  // Something else than the camera has changed: draw anew.
+  // Draw anew, because something other than the camera has changed.
   refresh() {
     this.stale = true;
-    this.n_still = 0; // pictures drawn since the camera stands still
+    this.n_still = 0; // pictures drawn since the camera has stood still
     this.movedAt = performance.now();
     this.wake();
   }
@@ -72,13 +72,13 @@ export class Viewer {
     this.refresh();
   }
 
-  // From now on the scene is shown in place of the poster: it is all there, or somebody turns it.
+  // Show the scene in place of the poster from now on, because all of it is there or a visitor has touched it.
   uncover() {
     this.covered = false;
     this.refresh();
   }
 
-  // Change the goal by a function of poses.
+  // Change the goal by a function that takes a pose and returns another.
   move(change) {
     this.touch();
     this.goal = change(this.goal);
@@ -87,7 +87,7 @@ export class Viewer {
     this.wake();
   }
 
-  // A visitor has done something: the slow turn ends.
+  // Note that a visitor has done something. This ends the slow turn.
   touch() {
     this.touchedAt = performance.now();
     if (this.covered) this.uncover();
@@ -118,7 +118,7 @@ export class Viewer {
     this.onview(-1);
   }
 
-  // Turn around what is seen at a place of the canvas, pixels of the page, from now on.
+  // Turn the camera, from now on, around what is seen at (x, y) of the canvas, in CSS pixels.
   async turnAround(x, y) {
     const { clientWidth, clientHeight } = this.canvas;
     const view = this.view(clientWidth, clientHeight);
@@ -127,13 +127,13 @@ export class Viewer {
     if (t !== null) this.fly(aimed(this.frame, this.pose, pointAt(view, x, y, t)));
   }
 
-  // The picture in the window, { width, height, rgba }, whole.
+  // Render the picture in the window at full size; resolve to { width, height, rgba }.
   picture() {
     const { layer, quality, background } = this;
     return this.renderer.render({ ...this.view(...this.size()), layer, quality, background });
   }
 
-  // Pixels of the screen that the canvas covers.
+  // Return the size [width, height] of the canvas in pixels of the screen.
   size() {
     const scale = window.devicePixelRatio || 1, { clientWidth, clientHeight } = this.canvas;
     return [Math.max(1, Math.round(clientWidth * scale)), Math.max(1, Math.round(clientHeight * scale))];
@@ -154,11 +154,11 @@ export class Viewer {
       this.n_still = 0;
     }
     if (moves || this.stale) this.draw(this.pace.moving(...this.size()), { quality: "fast", moving: moves });
-    else if (!this.covered && now - this.movedAt >= STILL_SECONDS * 1000) this.sharpen();
+    else if (now - this.movedAt >= STILL_SECONDS * 1000) this.sharpen();
     if (this.fence || this.flight || this.n_still <= N_WHOLE || this.turning || this.again) this.wake();
   }
 
-  // Bring the pose nearer to its goal; whether it moved.
+  // Bring the pose nearer to the goal; return whether it moved.
   advance(now, seconds) {
     if (this.turning && this.pace.stutters) this.turn(false);
     if (this.again && !this.turning && now - this.touchedAt > REST_SECONDS * 1000 && !this.pace.stutters) this.turn(true);
@@ -181,7 +181,7 @@ export class Viewer {
   sharpen() {
     const { quality, pace } = this, size = this.size(), sharp = pace.sharp(...size);
     if (this.n_still === 0 && sharp[0] === size[0]) this.n_still = 1;
-    const n = this.n_still - 1; // whole pictures that are there
+    const n = this.n_still - 1; // pictures at full size so far
     if (n > 0 && this.seconds > FEW_SECONDS) this.n_still = N_WHOLE + 1;
     if (this.n_still > N_WHOLE) {
       this.canvas.dataset.done = "";
@@ -205,7 +205,7 @@ export class Viewer {
     gl.flush();
   }
 
-  // Whether the last picture is finished; learns from the time that it took.
+  // Return whether the last picture is finished. If it is, the pace adapts to the time that the picture took.
   finished() {
     const gl = this.canvas.getContext("webgl2"), { sync, begin, moving } = this.fence;
     if (gl.getSyncParameter(sync, gl.SYNC_STATUS) !== gl.SIGNALED) return false;
@@ -215,12 +215,12 @@ export class Viewer {
     const pixels = this.drawn[0] * this.drawn[1];
     if (moving) this.pace.measured(pixels, this.seconds);
     else this.pace.stood(pixels, this.seconds);
-    // data-shown: the size of what is on the screen; data-done: no more comes until something changes
+    // data-shown: the size of the picture on the screen; data-done: no more pictures come until something changes
     if (moving || this.n_still > 0) this.canvas.dataset.shown = this.drawn.join("x");
     return true;
   }
 
-  // The graphics card is back, and has dropped everything.
+  // Draw anew after the graphics card is back, which has lost everything.
   restored() {
     this.fence = null;
     this.refresh();

@@ -1,7 +1,7 @@
 // The list of training views: choosing one flies there.
 
 export class Views {
-  // Fills the list `select`, with the buttons `before` and `after` beside it.
+  // Fill the list `select`, and connect it and the buttons `before` and `after` beside it with the viewer.
   constructor(viewer, cameras, { select, before, after }) {
     this.viewer = viewer;
     this.select = select;
@@ -19,10 +19,10 @@ export class Views {
       if (index >= 0) this.last = index;
     };
     this.last = -1;
-    viewer.onview(viewer.views.indexOf(viewer.pose)); // that of the address
+    viewer.onview(viewer.views.indexOf(viewer.pose)); // the view that the address names
   }
 
-  // Fly `steps` views further in the list, from the one that was chosen last; behind the last one it begins again.
+  // Fly to the view `steps` places after the one chosen last in the list, which continues from its end at its beginning.
   go(steps) {
     const from = this.last < 0 && steps < 0 ? 0 : this.last;
     this.viewer.flyToView((from + steps + this.n) % this.n);

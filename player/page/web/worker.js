@@ -1,5 +1,6 @@
-// Runs in a worker: a SceneReader that is asked by messages { call, args, id } and answers with { id, result } or
-// { id, error, isWhole }, and while it reads with { progress }.
+// Runs a SceneReader in a worker. Messages { call, args, id } call its methods and are answered by { id, result } or
+// { id, error, isWhole }. While a part is read, messages { progress } tell the bytes of each section. The worker's first
+// message is { isReady: true }.
 
 import { SceneReader } from "./scene_reader.js";
 

@@ -296,6 +296,25 @@ def test_coarser_qualities_fetch_less_and_look_alike(page: RenderPage, asset: As
     assert errors[0] <= errors[1] < 50
 
 
+def test_qualities_keep_to_the_lookups_that_the_bake_found(page: RenderPage) -> None:
+    """The manifest's `quality_fetches` limit the lookups; 0, or a manifest without them, leaves the page's
+    own."""
+    found = page.page.evaluate(
+        """() => {
+          const { manifest } = renderer.scene, before = manifest.quality_fetches;
+          const found = [[5, 3], [0, 3], undefined].map((limits) => {
+            manifest.quality_fetches = limits;
+            return ["exact", "high", "fast"].map((quality) => renderer.quality({ quality }).uFetches);
+          });
+          manifest.quality_fetches = before;
+          return [manifest.n_fetches, found];
+        }"""
+    )
+    k, (limited, limited_fast, own) = found
+    assert limited == [k, 5, 3] and limited_fast == [k, own[1], 3]
+    assert own == [k, -(-7 * k // 8), -(-k // 2)]
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
