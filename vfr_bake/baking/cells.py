@@ -186,7 +186,7 @@ def cull(
         if not weighty.any():
             continue
         visible = weighty | (held & beside(weighty))
-        loss = held_out.lost(every, _shown(model, held_out, visible))
+        loss = held_out.lost_by_leaving_out(every, _shown(model, held_out, visible))
         lost[tried] = loss.db
         if loss.most <= most_db or floor is not None:
             removed = 1 - float(visible.sum()) / max(int(held.sum()), 1)

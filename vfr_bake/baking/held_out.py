@@ -28,6 +28,7 @@ from player.errors import TrainingError
 from player.march.march import MIN_OPACITY, MarchResult
 from player.render import choose_march
 from vfr_bake.data.threads import in_threads
+from vfr_bake.data.witnesses import Witnesses
 from vfr_bake.rendering.render import head_colours
 from vfr_bake.training.length.witness_loss import Loss, WitnessLoss
 from vfr_bake.training.model_file import Model
@@ -52,6 +53,8 @@ RAYS_OF_A_VIEW = 20_000
 """Most rays of a view between cameras."""
 RAYS_BESIDE_WITNESSES = 5_000
 """Most rays of a view between cameras if the model has witnesses, whose rays make up for the difference."""
+N_LEARNED = 20_000
+"""Training pixels on which small changes are measured."""
 RAYS_AT_ONCE = 1 << 13
 """Rays that a thread marches at a time."""
 N_DIRECTIONS = 6
@@ -133,6 +136,8 @@ class Shown(NamedTuple):
     """[n_witnesses] float64: mean square error of each witness to its photograph; None without witnesses."""
     rgb: np.ndarray
     """[n, 3] float32: the pictures' colours, 0 to 1."""
+    learned: np.ndarray | None = None
+    """[n_learned] float64: mean square errors at some training pixels; None for a model without them."""
 
     def far_off(self, other: Shown) -> float:
         """Return the share of the pixels that differ from those of `other` by more than FAR_OFF in a
@@ -158,8 +163,8 @@ class Stage:
 
 
 class HeldOut:
-    """The rays on which a bake is measured (those of views between the training cameras first, then those of
-    the witnesses), with the model's colours over its background."""
+    """The rays on which a bake is measured, with the model's colours over its background: first those of
+    views between the training cameras, then those of the witnesses, then those of some training pixels."""
 
     def __init__(self, model: Model, n_views: int) -> None:
         witnesses = model.neutral_witnesses()
@@ -172,8 +177,11 @@ class HeldOut:
             n_pixels = camera.width * camera.height
             rays.append(camera.rays_through(random.choice(n_pixels, min(n_of_view, n_pixels), replace=False)))
         self._n_between = sum(len(rays_o) for rays_o, _ in rays)
-        if witnesses is not None:
-            rays.append(model.witness_rays())
+        learned = None if witnesses is None else _some_learned(model)
+        for pixels in (witnesses, learned):
+            if pixels is not None:
+                rays.append(model.rays(pixels))
+        self._n_learned = 0 if learned is None else len(learned.pixels)
         self.rays_o, self.rays_d = (np.concatenate(column) for column in zip(*rays, strict=True))
         self.background = model.background
         features, opacity, _ = model.sampler.composited_features(model.field, self.rays_o, self.rays_d)
@@ -186,7 +194,10 @@ class HeldOut:
             )
         self.wanted = (1 - opacity[:, None]) * self.background
         self.wanted[self._hits] += self._opacity * self._colours(self._features)
-        self._witnesses = None if witnesses is None else WitnessLoss(witnesses, self.background)
+        self._witnesses, self._learned = (
+            None if pixels is None else WitnessLoss(pixels, self.background)
+            for pixels in (witnesses, learned)
+        )
         self.own = self._compared(self.wanted)
         """The model's own pictures, with their errors."""
         self._model_psnr = float(model.figures.get("training_psnr") or DEFAULT_PSNR)
@@ -213,12 +224,17 @@ class HeldOut:
         first, second = (expected_loss(shown.error, self._model_psnr) for shown in (before, after))
         return Loss(second - first, None)
 
-    def shows(self, after: Shown, db: float) -> bool:
-        """Return whether the witnesses show that `after` loses more than `db` dB; without witnesses, whether
-        the estimated loss is larger."""
-        if self._witnesses is None or self.own.errors is None or after.errors is None:
-            return self.lost(self.own, after).least > db
-        return self._witnesses.shows(self.own.errors, after.errors, db)
+    def lost_by_leaving_out(self, before: Shown, after: Shown) -> Loss:
+        """Return the loss of `after`, from which something small was left out, measured on training pixels.
+
+        They are many, each from another place, and the model shows them better than views that it does not
+        know. So a loss is seen there that witnesses would hardly show
+        (docs/notes/2026-11-29-patches-of-witnesses.md). For a model without training pixels, the loss is that
+        of `lost`.
+        """
+        if self._learned is None or before.learned is None or after.learned is None:
+            return self.lost(before, after)
+        return self._learned.loss(before.learned, after.learned)
 
     def loss_of_change(self, before: Shown, after: Shown) -> float:
         """Return the loss in dB of a small change of the pictures that does not depend on the photographs,
@@ -226,15 +242,14 @@ class HeldOut:
 
         The errors of such a change are independent of the errors that the pictures already have, so their
         squares are expected to add up. The loss expected from this has a standard error of half its size
-        (EXPECTED_SPREAD). It varies far less from pixel to pixel than the loss measured on the witnesses,
-        which contains the product of the two errors. Returns the mean of both losses, each weighted with
-        1 / spread^2.
+        (EXPECTED_SPREAD). It varies far less from pixel to pixel than the measured loss, which contains the
+        product of the two errors. Returns the mean of both losses, each weighted with 1 / spread^2.
         """
-        measured = self.lost(before, after)
-        if self._witnesses is None or before.errors is None or not measured.spread:
+        measured = self.lost_by_leaving_out(before, after)
+        if self._learned is None or before.learned is None or not measured.spread:
             return measured.db
-        a, b = (np.clip(shown.rgb[self._n_between :], 0.0, 1.0, dtype=float) for shown in (before, after))
-        expected = self._witnesses.loss(before.errors, before.errors + ((b - a) ** 2).mean(axis=1)).db
+        a, b = (np.clip(shown.rgb[-self._n_learned :], 0.0, 1.0, dtype=float) for shown in (before, after))
+        expected = self._learned.loss(before.learned, before.learned + ((b - a) ** 2).mean(axis=1)).db
         noise = measured.spread**2
         share = noise / (noise + (EXPECTED_SPREAD * expected) ** 2)
         return measured.db + share * (expected - measured.db)
@@ -287,10 +302,12 @@ class HeldOut:
 
     def _compared(self, rgb: np.ndarray) -> Shown:
         """Compute the errors of the colours [n, 3] of all rays."""
-        between, of_witnesses = slice(self._n_between), slice(self._n_between, None)
+        end = len(rgb) - self._n_learned
+        between, of_witnesses = slice(self._n_between), slice(self._n_between, end)
         error = float(np.mean((rgb[between].astype(np.float64) - self.wanted[between]) ** 2))
         errors = None if self._witnesses is None else self._witnesses.errors(rgb[of_witnesses])
-        return Shown(error, errors, rgb)
+        learned = None if self._learned is None else self._learned.errors(rgb[end:])
+        return Shown(error, errors, rgb, learned)
 
     def march(self, grid: SparseGrid, n_fetches: int) -> MarchResult:
         """March the rays through `grid` as the player does, with `n_fetches` feature lookups a ray."""
@@ -345,6 +362,17 @@ class HeldOut:
             }
             for stage in self.stages
         ]
+
+
+def _some_learned(model: Model) -> Witnesses | None:
+    """Return about N_LEARNED of a model's training pixels, spread evenly, with the colours that the field
+    should show; None if it has none."""
+    if model.training_pixels is None or not len(model.training_pixels.pixels):
+        return None
+    some = model.training_pixels.some(N_LEARNED)
+    if model.exposure is not None:
+        some = model.exposure.neutral(some)
+    return Witnesses(some.counts, some.pixels, some.rgba, np.zeros(0, np.int32))
 
 
 def expected_loss(error: float, model_psnr: float) -> float:

@@ -139,7 +139,12 @@ class Model:
             return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32), np.zeros((0, 4), np.uint8)
         pixels = self.training_pixels
         rgba = (pixels if self.exposure is None else self.exposure.neutral(pixels)).rgba
-        return *pixels.rays(self._in_model_frame()), rgba
+        return *self.rays(pixels), rgba
+
+    def rays(self, pixels: ViewPixels) -> tuple[np.ndarray, np.ndarray]:
+        """Return the origins and unit directions of the rays of pixels of the training views, [n, 3] float32
+        each, in the model frame."""
+        return pixels.rays(self._in_model_frame())
 
     def _in_model_frame(self) -> list[Camera]:
         model_from_world = np.linalg.inv(self.world_from_model)

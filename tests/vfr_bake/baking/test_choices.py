@@ -112,7 +112,7 @@ def test_longer_steps_keep_to_the_loss_that_was_asked_for(
             lost = 0.48 + 0.01 * (int(max(grid.level_steps)) - 1)
             return SimpleNamespace(loss=Loss(lost, 0.0), shown=lost)
 
-        def lost(self, before: float, after: float) -> Loss:
+        def lost_by_leaving_out(self, before: float, after: float) -> Loss:
             return Loss(after - before, 0.0)
 
     detail = Detail(Seen(), None, 0, 0.1, silent)  # type: ignore[arg-type]

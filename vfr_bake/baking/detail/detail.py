@@ -144,7 +144,10 @@ class Detail:
             steps = np.minimum(1 << np.arange(grid.n_levels), longest).astype(np.int32)
             after = self._stage(replace(grid, level_steps=steps))
             fits = max_loss_db is None or after.loss.db <= max_loss_db
-            if fits and self.held_out.lost(before, after.shown).most <= STEP_LOSS * self.most_db:
+            if (
+                fits
+                and self.held_out.lost_by_leaving_out(before, after.shown).most <= STEP_LOSS * self.most_db
+            ):
                 return tuple(steps.tolist())
         return (1,) * grid.n_levels
 
@@ -166,7 +169,7 @@ class Detail:
         def lost(share: float) -> Loss:
             live = live_of_blocks(heavy_blocks(weights, float(np.exp(share)))).astype("<u8")
             seen = replace(grid, live=grid.live & live.view(np.uint8).reshape(-1))
-            return self.held_out.lost(before, self._look(seen))
+            return self.held_out.lost_by_leaving_out(before, self._look(seen))
 
         found = largest(lost, np.log(LEAST_SHARE), np.log(MOST_SHARE), SEEN_LOSS * self.most_db)
         if found is None:
@@ -226,7 +229,7 @@ class Detail:
 
         def lost(amount: float) -> Loss:
             shown = choice.levels(choice.dropped(choice.worth(amount)))
-            return self.held_out.lost(before, self._look(levels.at(shown)))
+            return self.held_out.lost_by_leaving_out(before, self._look(levels.at(shown)))
 
         found = largest(lost, 0.0, 1.0, share * self.most_db)
         if found is None:

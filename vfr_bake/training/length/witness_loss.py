@@ -100,14 +100,6 @@ class WitnessLoss:
             variance += (len(changes) - 1) / len(changes) * float((changes**2).sum())
         return Loss(db, float(np.sqrt(variance)))
 
-    def shows(self, before: np.ndarray, after: np.ndarray, db: float) -> bool:
-        """Return whether more than `db` is lost beyond chance, at all witnesses and also in the mean of the
-        whole views, if there are any. Patches alone do not prove a loss: some of what training has learned
-        around them is in no other view.
-        """
-        of_last_kind, _ = self._of_kinds(before, after)[-1]
-        return self.loss(before, after).least > db and of_last_kind > db
-
     def _of_kinds(self, before: np.ndarray, after: np.ndarray) -> list[tuple[float, np.ndarray]]:
         """Return, for each kind of witness, its loss in dB and the losses [n_blocks] without each block."""
         sums = np.stack([np.bincount(self._block, e, self._n_blocks) for e in (before, after)], axis=1)

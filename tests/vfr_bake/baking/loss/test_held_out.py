@@ -119,30 +119,35 @@ def test_what_shows_the_models_pictures_loses_nothing(model: Model) -> None:
     assert held_out.is_better(dimmed, own) and not held_out.is_better(own, dimmed)
 
 
-def test_what_a_small_change_loses_is_known_better_than_the_witnesses_alone_measure_it(model: Model) -> None:
-    """The loss of a small change that does not depend on the photographs, here noise, is known better than
-    witnesses measure it: its mean square adds to the model's errors."""
+def test_what_a_small_change_loses_is_known_better_than_it_is_measured(model: Model) -> None:
+    """The loss of a small change that does not depend on the photographs, here noise, is known better than it
+    can be measured: its mean square adds to the model's errors at the training pixels."""
     held_out = HeldOut(model, 1)
     own = held_out.own
     noise, measured, found, added = np.random.default_rng(0), [], [], []
     for _ in range(8):
         rgb = (own.rgb + noise.normal(0, 0.01, own.rgb.shape)).astype(np.float32)
         shown = held_out._compared(rgb)
-        measured.append(held_out.lost(own, shown).db)
+        assert shown.learned is not None and own.learned is not None and held_out._learned is not None
+        measured.append(held_out._learned.loss(own.learned, shown.learned).db)
         found.append(held_out.loss_of_change(own, shown))
-        added.append(((np.clip(rgb, 0, 1) - np.clip(own.rgb, 0, 1))[held_out._n_between :] ** 2).mean(axis=1))
-    assert held_out._witnesses is not None and own.errors is not None
-    expected = held_out._witnesses.loss(own.errors, own.errors + np.mean(added, axis=0)).db
+        added.append(
+            ((np.clip(rgb, 0, 1) - np.clip(own.rgb, 0, 1))[-held_out._n_learned :] ** 2).mean(axis=1)
+        )
+    assert held_out._learned is not None and own.learned is not None
+    expected = held_out._learned.loss(own.learned, own.learned + np.mean(added, axis=0)).db
     assert np.mean(found) == pytest.approx(expected, rel=0.1) and np.std(found) < np.std(measured)
 
 
 def test_a_change_that_knows_the_photographs_is_measured(model: Model) -> None:
-    """A change that depends on the photographs, such as half of the opacity, is measured at the witnesses: it
-    loses decibels, of which the estimate for independent errors says little."""
+    """A change that depends on the photographs, such as half of the opacity, is measured at the training
+    pixels: it loses decibels, of which the estimate for independent errors says little."""
     held_out = HeldOut(model, 1)
     features, opacity, _ = model.sampler.composited_features(model.field, held_out.rays_o, held_out.rays_d)
     own, dimmed = (held_out.compare(features, share * opacity) for share in (1.0, 0.5))
-    measured, change = held_out.lost(own, dimmed), held_out.loss_of_change(own, dimmed)
+    assert held_out._learned is not None and own.learned is not None and dimmed.learned is not None
+    measured = held_out._learned.loss(own.learned, dimmed.learned)
+    change = held_out.loss_of_change(own, dimmed)
     assert measured.spread is not None
     assert abs(change - measured.db) < measured.spread
     assert held_out.loss_of_change(own, own) == 0

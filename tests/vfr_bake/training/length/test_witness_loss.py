@@ -131,21 +131,6 @@ def test_the_spread_is_as_large_as_the_losses_of_other_witnesses_differ() -> Non
     assert np.mean(spreads) == pytest.approx(np.std(losses), rel=0.12)
 
 
-@pytest.mark.parametrize(
-    ("of_patches", "of_whole", "shown"), [(1.0, 1.0, True), (1.0, 0.1, False), (0.1, 0.1, False)]
-)
-def test_a_loss_is_shown_where_whole_views_show_it_too(
-    of_patches: float, of_whole: float, shown: bool
-) -> None:
-    witnesses = some_witnesses([30] * 20 + [400, 300], [20, 21])
-    measured = WitnessLoss(witnesses, WHITE)
-    before = np.random.default_rng(5).exponential(0.01, len(witnesses.pixels))
-    lost = np.where(witnesses.views() < 20, of_patches, of_whole)
-    assert measured.shows(before, before * 10 ** (lost / 10), 0.5) is shown
-    alone = WitnessLoss(some_witnesses([30] * 20, []), WHITE)
-    assert alone.shows(before[:600], 1.2 * before[:600], 0.5)
-
-
 def test_a_loss_in_words() -> None:
     assert str(Loss(0.1234, 0.02)) == "0.12 dB (give or take 0.02)"
     assert str(Loss(0.1234, None)) == "an expected 0.12 dB" and Loss(0.5, None).most == 0.5
