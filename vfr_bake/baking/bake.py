@@ -315,8 +315,8 @@ class _Bake:
         ranges: tuple[Range, ...] | None,
         head_bytes: int,
     ) -> GridArrays:
-        """Choose the codes to store: the fewest bits whose loss on the witnesses stays within the limit and
-        that fit the bytes asked for."""
+        """Choose the codes to store: the fewest bits whose loss stays within the limit and that fit the bytes
+        asked for."""
         held_out, config, layout = self.held_out, self.config, needed.layout
         head = runner(weights, ranges)
         stored = Stored(weights, needed.features, needed.density)

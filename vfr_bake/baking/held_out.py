@@ -1,8 +1,9 @@
-"""Measure the stages of a bake on held-out pixels: the model's witnesses, and views between the training
-cameras.
+"""Measure the stages of a bake: on the model's witnesses, on views between the training cameras, and on some
+training pixels.
 
 The *witnesses* are pixels of photographs that training has not learned from (`vfr_bake.data.witnesses`). The
 loss of a bake is what the asset loses on them, compared with the model. The bake chooses by this loss.
+What it leaves out bit by bit loses too little for that, and is measured on 20,000 *training pixels*.
 
 On the *views between* the training cameras, the model's own pictures are the reference. The agreement of a
 stage with them is reported as a PSNR. It decides between stages where the witnesses see no difference.
