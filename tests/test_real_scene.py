@@ -36,7 +36,7 @@ TRAIN = [
     *("--n-levels", "8", "--max-resolution", "512", "--log2-table-size", "15", "--head-width", "32"),
 ]
 BAKE = [
-    *("--resolution", "192", "--feature-resolution", "128", "--refine-steps", "40", "--check-views", "1"),
+    *("--resolution", "192", "--feature-resolution", "160", "--refine-steps", "40", "--check-views", "1"),
     *("--mesh-resolution", "48", "--max-memory", "1.4", "--head-width", "0", "--weight-floor", "0.01"),
 ]
 
@@ -69,7 +69,7 @@ def out(fox: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_the_asset_holds_all_of_space(out: Path) -> None:
     manifest = Asset.open(out / "asset", verify=True).manifest
-    assert manifest.contracted and (manifest.resolution, manifest.feature_resolution) == (192, 128)
+    assert manifest.contracted and (manifest.resolution, manifest.feature_resolution) == (192, 160)
     assert json.loads((out / "play.json").read_text())["march"] == "numba"
 
 
@@ -106,7 +106,7 @@ def test_the_command_writes_the_view_that_the_renderer_makes(out: Path) -> None:
 def test_the_bake_says_what_it_lost(out: Path) -> None:
     figures = json.loads((out / "bake.json").read_text())
     stages = {stage["name"]: stage["psnr"] for stage in figures["stages"]}
-    assert stages["codes"] > 31, "32.1 where it was measured"
+    assert stages["codes"] > 31, "31.7 and 32.6 by the seed of training"
     assert stages["refined"] > 29.5, "31.0: photographs, from which it has learned, differ from the model"
     assert stages["files"] > stages["k"] - 0.5, "0.4 dB more where it was measured: refined for its lookups"
     assert figures["psnr_to_full_model"] == pytest.approx(stages["files"])

@@ -207,8 +207,9 @@ def test_damaged_files() -> None:
 def test_bad_volumes() -> None:
     empty = Volume(np.zeros((0, 3), np.int32), np.zeros(0, np.float32), None, np.eye(4))
     far = Volume(np.array([[4096, 0, 0]], np.int32), np.ones(1, np.float32), None, np.eye(4))
-    for volume in (empty, far):
-        with pytest.raises(ConfigError, match="VDB: volume: expected 1 or more vertices below 4096"):
+    for volume, got in ((empty, "0 up to 0"), (far, "1 up to 4096")):
+        said = f"VDB: volume: expected 1 or more vertices with indices below 4096, got {got}"
+        with pytest.raises(ConfigError, match=said):
             vdb_bytes(volume)
     with pytest.raises(ShapeError, match=r"volume: density: expected \[1\], got \[2\]"):
         Volume(np.zeros((1, 3), np.int32), np.zeros(2, np.float32), None, np.eye(4))

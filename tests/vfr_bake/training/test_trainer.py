@@ -303,13 +303,22 @@ def test_colours_can_be_composited_instead(scene: Scene) -> None:
 
 
 def test_an_unbounded_scene_is_learnt() -> None:
+    """Three seeds gain 8.5 dB and more on learned views, and 4.4 dB and more on test views. More steps gain
+    less on test views: the scene has few views."""
     scene = unbounded(48)
-    trainer = Trainer(scene, config(steps=300, pilot_steps=60, batch_rays=128))
-    before = np.mean([s.psnr for s in evaluate(trained_model(trainer, scene, {}), scene.test)])
+    trainer = Trainer(scene, config(steps=150, pilot_steps=60, batch_rays=128))
+
+    def psnr() -> list[float]:
+        model = trained_model(trainer, scene, {})
+        return [
+            float(np.mean([s.psnr for s in evaluate(model, views)])) for views in (scene.train, scene.test)
+        ]
+
+    before = psnr()
     reports = list(trainer.run())
-    after = np.mean([s.psnr for s in evaluate(trained_model(trainer, scene, {}), scene.test)])
-    assert trainer.n_bad_steps == 0 and len(reports) == 300
-    assert after > before + 4
+    learned, test = np.subtract(psnr(), before)
+    assert trainer.n_bad_steps == 0 and len(reports) == 150
+    assert learned > 7 and test > 4
 
 
 def test_a_gradient_that_is_not_finite_changes_nothing(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
