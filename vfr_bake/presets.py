@@ -66,14 +66,14 @@ PRESETS: dict[Preset, BakeChoice] = {
     "fidelity": BakeChoice(
         cells_per_pixel=1.95, contracted_resolution=1536, feature_share=0.68, culled_loss_db=0.02,
         n_channels=22, channel_loss_db=0.03, n_fetches=16, sample_loss_db=0.005,
-        code_loss_db=0.014, density_step=2, code_levels=127, head_width=0, head_layers=3,
+        code_loss_db=0.02, density_step=2, code_levels=127, head_width=0, head_layers=3,
         head_bands=4, head_bits=8, refine_steps=1600, mesh_resolution=128, target_loss_db=0.05,
         page_mb=1024,
     ),
     "balanced": BakeChoice(
         cells_per_pixel=1.65, contracted_resolution=1408, feature_share=0.775, culled_loss_db=0.06,
         n_channels=16, channel_loss_db=0.15, n_fetches=12, sample_loss_db=0.05,
-        code_loss_db=0.042, density_step=4, code_levels=50, head_width=64, head_layers=3,
+        code_loss_db=0.13, density_step=4, code_levels=50, head_width=64, head_layers=3,
         head_bands=4, head_bits=8, refine_steps=3600, mesh_resolution=128, target_loss_db=0.4,
         page_mb=512,
     ),
