@@ -370,9 +370,7 @@ def _some_learned(model: Model) -> Witnesses | None:
     should show; None if it has none."""
     if model.training_pixels is None or not len(model.training_pixels.pixels):
         return None
-    some = model.training_pixels.some(N_LEARNED)
-    if model.exposure is not None:
-        some = model.exposure.neutral(some)
+    some = model.neutral(model.training_pixels.some(N_LEARNED))
     return Witnesses(some.counts, some.pixels, some.rgba, np.zeros(0, np.int32))
 
 

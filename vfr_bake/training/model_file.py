@@ -32,7 +32,7 @@ from player.cameras.transforms import parse_transforms, transforms_cameras, writ
 from player.errors import ConfigError, FormatError, VersionError
 from player.files.json_files import brief
 from vfr_bake.config import FieldConfig, field_config_from
-from vfr_bake.data.view_pixels import ViewPixels
+from vfr_bake.data.view_pixels import SomePixels, ViewPixels
 from vfr_bake.data.witnesses import Witnesses
 from vfr_bake.field.field import VfrField
 from vfr_bake.field.hash_grid import GridLayout
@@ -127,9 +127,11 @@ class Model:
     def neutral_witnesses(self) -> Witnesses | None:
         """Return the witnesses with the colours that the field should show, without their pictures'
         exposure."""
-        if self.witnesses is None or self.exposure is None:
-            return self.witnesses
-        return self.exposure.neutral(self.witnesses)
+        return None if self.witnesses is None else self.neutral(self.witnesses)
+
+    def neutral(self, pixels: SomePixels) -> SomePixels:
+        """Return pixels of the training views with the colours that the field should show."""
+        return pixels if self.exposure is None else self.exposure.neutral(pixels)
 
     def training_pixel_rays(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the origins and unit directions of the training pixels' rays, [n, 3] float32 each, in the
@@ -137,9 +139,7 @@ class Model:
         training pixels."""
         if self.training_pixels is None:
             return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32), np.zeros((0, 4), np.uint8)
-        pixels = self.training_pixels
-        rgba = (pixels if self.exposure is None else self.exposure.neutral(pixels)).rgba
-        return *self.rays(pixels), rgba
+        return *self.rays(self.training_pixels), self.neutral(self.training_pixels).rgba
 
     def rays(self, pixels: ViewPixels) -> tuple[np.ndarray, np.ndarray]:
         """Return the origins and unit directions of the rays of pixels of the training views, [n, 3] float32

@@ -183,7 +183,7 @@ class PixelSampler:
         self._joined = None if isinstance(views.images, StoredImages) else views.joined(learned)
         self._views, self._generator, self._masked = views.some(learned), generator, masked
         patches = [] if witnesses is None else witnesses.patches(views.cameras)
-        self._patches = _joined([patches[view] for view in learned] if patches else [])
+        self._patches = _joined([patches[view] for view in learned if patches])
         images = self._views.images
         self._n_chunks = images.n_chunks if isinstance(images, StoredImages) else 1
         self._by_detail = by_detail and not isinstance(images, StoredImages)

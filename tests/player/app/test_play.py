@@ -100,7 +100,7 @@ def test_settings_that_contradict_each_other(output: str, settings: dict[str, An
 
 
 def test_a_picture_that_takes_much_memory_is_told_of(asset: Asset) -> None:
-    """Of the pictures asked for, the largest is reported if it takes much memory, whatever their order."""
+    """The largest picture asked for is reported if it takes much memory, whatever the order of pictures."""
     small = read_cameras(asset.path("cameras.json"))[0]
     pixels = math.ceil(LARGE_BYTES / FRAME_BYTES)
     wide, square = (

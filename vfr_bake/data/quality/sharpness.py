@@ -28,7 +28,7 @@ FAR_OFF, LEAST_DIFFERENCE = 5.0, 0.08
 """A picture is blurred if its blur exceeds the median by more than FAR_OFF median absolute deviations and by
 more than LEAST_DIFFERENCE."""
 FEWEST = 8
-"""Of fewer pictures none is called blurred, because they have no typical one to be compared with."""
+"""Least number of pictures among which some are called blurred: fewer have no typical one to compare with."""
 
 
 def blur(image: np.ndarray) -> float:
