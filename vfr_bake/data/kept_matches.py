@@ -4,7 +4,8 @@ An estimation that was interrupted continues where it stopped, and one with addi
 the features and matches that are known. If the disk refuses to keep more, the estimation goes on without.
 
 There are two files of records, one record after the other, little-endian. A last record that is cut short
-does not count.
+does not count, and the next one takes its place. Of several processes that write to the same files, all but
+one stop when they notice.
 
 - `features.bin`: stamp of the picture (16 bytes), sharpness (float64), width, height and number of features n
   (uint32 each), thumbnail (32 x 32 bytes, grey), n points (2 float32), n descriptors (128 bytes).
@@ -67,18 +68,21 @@ class KeptMatches:
     threads."""
 
     def __init__(self, folder: Path, say: Callable[[str], object] | None = None) -> None:
-        """Open the records in `folder`, which is made if it is missing; what cannot be read at the end of a
-        file is cut off. `say`: called once, with a sentence, if the disk refuses to keep more."""
+        """Open the records in `folder`, which is made if it is missing. `say`: called once, with a sentence,
+        if no more can be kept."""
         self._folder = folder
         self._say = say or (lambda text: None)
         self._lock = threading.Lock()
         self._looks: dict[bytes, int] = {}
         self._matches: dict[bytes, int] = {}
+        self._ends: dict[Path, tuple[int, int]] = {}
+        """By file, where the next record goes, and the size that the file has unless another process has
+        written to it."""
         self._keeps = True
         try:
             self._open()
         except OSError as error:
-            self._give_up(error)
+            self._give_up(error.strerror or str(error))
 
     def _open(self) -> None:
         self._folder.mkdir(parents=True, exist_ok=True)
@@ -86,9 +90,9 @@ class KeptMatches:
             (self._looks_path, _LOOK, self._looks, lambda n: SIDE * SIDE + n * _BYTES_A_FEATURE),
             (self._matches_path, _MATCHES, self._matches, lambda n: n * _BYTES_A_MATCH),
         ):
+            end = size = 0
             if path.exists():
-                end = 0
-                with path.open("r+b") as file:
+                with path.open("rb") as file:
                     size = path.stat().st_size
                     while (record := _header(file, end, header)) is not None:
                         next_end = end + header.size + n_bytes(record[-1])
@@ -96,12 +100,12 @@ class KeptMatches:
                             break
                         index[b"".join(part for part in record if isinstance(part, bytes))] = end
                         end = next_end
-                    file.truncate(end)
+            self._ends[path] = end, size
 
-    def _give_up(self, error: OSError) -> None:
+    def _give_up(self, reason: str) -> None:
         self._keeps = False
         self._say(
-            f"{self._folder}: cannot write: {error.strerror or error}: no more features and matches are "
+            f"{self._folder}: cannot write: {reason}: no more features and matches are "
             "kept: if the estimation of cameras is interrupted, it looks for them again"
         )
 
@@ -165,14 +169,18 @@ class KeptMatches:
         with self._lock:
             if not self._keeps:
                 return
+            at, size = self._ends[path]
             try:
                 with path.open("ab") as file:
-                    at = file.tell()
+                    if file.tell() != size:
+                        self._give_up("another process writes there")
+                        return
+                    file.truncate(at)
                     file.write(record)
             except OSError as error:
-                self._give_up(error)
+                self._give_up(error.strerror or str(error))
                 return
-            index[key] = at
+            index[key], self._ends[path] = at, (at + len(record),) * 2
 
     def remove(self) -> None:
         """Delete the folder."""

@@ -74,8 +74,23 @@ def test_a_number_that_cannot_be_ends_the_file(folder: Path):
     content = bytearray(path.read_bytes())
     content[32:36] = b"\xff" * 4
     path.write_bytes(content)
-    assert KeptMatches(folder).look(A) is None
-    assert path.stat().st_size == 0
+    kept = KeptMatches(folder)
+    assert kept.look(A) is None
+    kept.keep_look(C, made(2, 0))
+    assert same(KeptMatches(folder).look(C), made(2, 0))
+    assert path.stat().st_size == 36 + SIDE * SIDE
+
+
+def test_of_two_processes_the_one_that_notices_the_other_keeps_no_more(folder: Path):
+    said: list[str] = []
+    first, second = KeptMatches(folder), KeptMatches(folder, said.append)
+    for number in range(3):
+        first.keep_look(bytes([number]) * 16, made(number, 4))
+        second.keep_look(bytes([100 + number]) * 16, made(number, 5))
+    assert len(said) == 1 and "another process" in said[0]
+    for kept in (first, KeptMatches(folder)):
+        assert all(same(kept.look(bytes([number]) * 16), made(number, 4)) for number in range(3))
+    assert second.look(bytes([100]) * 16) is None and same(second.look(A), made(0, 7))
 
 
 def test_a_picture_that_changed_has_another_stamp(tmp_path: Path):
