@@ -25,7 +25,7 @@ from player.errors import ConfigError, MissingExtraError
 from player.files.images import to_8_bit
 from player.head.head import Head
 from player.march.bounds import block_bounds
-from player.march.interpolation import OPAQUE_DEPTH, Quality, Stage, interpolate, stages
+from player.march.interpolation import OPAQUE_DEPTH, MarchStage, Quality, interpolate, stages
 from player.march.march import MarchResult
 from player.march.normals import composited_normals
 from player.march.pixels import EVERY, Planes, write_pixels
@@ -210,7 +210,7 @@ class Renderer:
             features=np.zeros((n_pixels, self.asset.manifest.n_channels), np.float32) if layers else None,
         )
 
-    def _in_tasks(self, picture: _Picture, stage: Stage) -> None:
+    def _in_tasks(self, picture: _Picture, stage: MarchStage) -> None:
         """Compute the pixels of a stage in all blocks, on all threads."""
         tasks = self._tasks(picture.view.blocks, len(stage.within))
         futures = [self._pool.submit(self._task, picture, stage, blocks) for blocks in tasks]
@@ -229,7 +229,7 @@ class Renderer:
         )
         return [blocks[i : i + size] for i in range(0, len(blocks), size)]
 
-    def _task(self, picture: _Picture, stage: Stage, blocks: np.ndarray) -> None:
+    def _task(self, picture: _Picture, stage: MarchStage, blocks: np.ndarray) -> None:
         """Compute the pixels of a stage in some blocks: pixels that cannot be interpolated are marched and
         shaded."""
         view, planes, camera = picture.view, picture.planes, picture.view.camera

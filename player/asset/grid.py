@@ -64,7 +64,7 @@ class VertexRows:
     it is not stored. Bricks have an apron, so that the eight corners of a cell are in one brick."""
 
 
-class Found(NamedTuple):
+class LocatedPoints(NamedTuple):
     """Points located in a `SparseGrid`: the finest brick at each, and the cell of that brick's level."""
 
     entries: np.ndarray
@@ -149,7 +149,7 @@ class SparseGrid:
         whose index is a multiple of this number."""
         return int(self.level_steps[-1])
 
-    def find(self, g: np.ndarray) -> Found:
+    def find(self, g: np.ndarray) -> LocatedPoints:
         """Locate the points `g` [3, ...], in grid coordinates."""
         cells = self.cells(g)
         entries = self.entries(cells)
@@ -166,7 +166,7 @@ class SparseGrid:
             )
         else:
             live = np.zeros(slots.shape, bool)
-        return Found(entries, cells, fractions, live)
+        return LocatedPoints(entries, cells, fractions, live)
 
     @property
     def codes(self) -> np.ndarray:

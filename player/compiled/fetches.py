@@ -127,7 +127,7 @@ than others, its weight is 0. k is at least 1: to fetch at every sample, `sample
 """
 
 
-class Stored(NamedTuple):
+class StoredFeatures(NamedTuple):
     """The features of a `player.asset.grid.SparseGrid`, and the grid of their vertices."""
 
     bricks: np.ndarray

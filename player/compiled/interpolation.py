@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 
 from player.compiling import compiled, inlined
-from player.march.interpolation import Stage
+from player.march.interpolation import MarchStage
 from player.march.pixels import Pixels, Planes
 from player.scratch import check_scratch, scratch
 
@@ -14,7 +14,7 @@ F32 = np.float32
 
 
 def interpolate(
-    planes: Planes, size: tuple[int, int], pixels: Pixels, stage: Stage, transparent: bool
+    planes: Planes, size: tuple[int, int], pixels: Pixels, stage: MarchStage, transparent: bool
 ) -> np.ndarray:
     """Interpolate pixels as `player.march.interpolation.interpolate` does."""
     if not len(stage.neighbours):

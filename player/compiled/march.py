@@ -13,7 +13,7 @@ import numpy as np
 
 from player.asset.grid import SparseGrid
 from player.compiled.add_rows import CHANNELS, add_rows
-from player.compiled.fetches import Stored, choose_fetches, stored_corners
+from player.compiled.fetches import StoredFeatures, choose_fetches, stored_corners
 from player.compiled.lanes import LANES
 from player.compiled.packets import (
     BOX_ROWS,
@@ -55,7 +55,7 @@ class Work(NamedTuple):
     masses: np.ndarray
     """[LANES] float32: opacities, 0 where nothing is fetched."""
     into: np.ndarray
-    """[LANES] int64: the row of `Found.features` that each ray's fetches are added to."""
+    """[LANES] int64: the row of `MarchOutputs.features` that each ray's fetches are added to."""
     places: np.ndarray
     """[3, LANES] float32: the position of one fetch of each ray, in cells of the densities' grid."""
     weights: np.ndarray
@@ -66,7 +66,7 @@ class Work(NamedTuple):
     """[9, LANES] float32: shares of these rows, as `stored_corners` finds them."""
 
 
-class Found(NamedTuple):
+class MarchOutputs(NamedTuple):
     """The results for n rays. `player.march.march.MarchResult` gets the first rows of the last two arrays."""
 
     opacity: np.ndarray
@@ -102,7 +102,7 @@ def march(
         rows=scratch((8, LANES), np.int32),
         shares=scratch((9, LANES), F32),
     )
-    found = Found(
+    found = MarchOutputs(
         opacity=scratch(n_rays, F32, 0),
         depth=scratch(n_rays, F32, 0),
         n_density_samples=scratch(n_rays, np.int32, 0),
@@ -112,7 +112,7 @@ def march(
     vertices = grid.rows
     n_hits = _march_rays(
         lookup,
-        Stored(
+        StoredFeatures(
             vertices.bricks, vertices.rows, grid.features, vertices.resolution, vertices.n_per_axis,
             grid.feature_scale,
         ),

@@ -23,7 +23,7 @@ MARGIN_PX = 0.01
 """Pixels by which projections are grown: far more than the rounding of float64."""
 
 
-class Bricks(NamedTuple):
+class CameraBricks(NamedTuple):
     """n bricks of one size in camera coordinates: x points right, y up, and the camera looks along -z."""
 
     firsts: np.ndarray
@@ -35,7 +35,7 @@ class Bricks(NamedTuple):
     most. Both are 1 but for the error of the camera's rotation, which is checked to a thousandth."""
 
 
-def seen_bricks(grid: SparseGrid, camera: Camera) -> Bricks:
+def seen_bricks(grid: SparseGrid, camera: Camera) -> CameraBricks:
     """Return the bricks in which rays look for live cells, as `camera` sees them; it is in the model
     frame."""
     edge = BRICK / grid.cells_per_unit.astype(np.float64)
@@ -43,7 +43,7 @@ def seen_bricks(grid: SparseGrid, camera: Camera) -> Bricks:
     steps = (w2c[:3, :3] * edge).T
     most, _, least = np.linalg.svd(camera.c2w[:3, :3], compute_uv=False)
     firsts = grid.places @ steps + (w2c[:3, :3] @ grid.aabb_min + w2c[:3, 3])
-    return Bricks(firsts, steps, (float(least), float(most)))
+    return CameraBricks(firsts, steps, (float(least), float(most)))
 
 
 def block_bounds(grid: SparseGrid, camera: Camera) -> tuple[np.ndarray, np.ndarray]:

@@ -54,7 +54,7 @@ class Agreement(NamedTuple):
     `opacity` may be at any depths."""
 
 
-class Stage(NamedTuple):
+class MarchStage(NamedTuple):
     """One stage of a picture: pixels that are found at the same time."""
 
     within: np.ndarray
@@ -70,7 +70,7 @@ _NONE = np.zeros((0, 2), np.int64)
 
 
 @lru_cache(maxsize=64)
-def stages(levels: float, contracted: bool = False) -> tuple[Stage, ...]:
+def stages(levels: float, contracted: bool = False) -> tuple[MarchStage, ...]:
     """Return the stages of a picture, in their order.
 
     Args:
@@ -87,27 +87,30 @@ def stages(levels: float, contracted: bool = False) -> tuple[Stage, ...]:
     [4, 4, 8, 16, 32]
     """
     if not levels:
-        return (Stage(EVERY, _NONE, _NOTHING),)
+        return (MarchStage(EVERY, _NONE, _NOTHING),)
     if contracted:
         return _pattern(4, (_agreement(OF_FIRST_HALVING * levels), _agreement(levels)))
     return _pattern(2, (_agreement(levels),), probed=True)
 
 
-def _pattern(spacing: int, agreements: tuple[Agreement, ...], probed: bool = False) -> tuple[Stage, ...]:
+def _pattern(spacing: int, agreements: tuple[Agreement, ...], probed: bool = False) -> tuple[MarchStage, ...]:
     """Return the stages that begin with a lattice of `spacing` pixels, a power of two up to BLOCK.
     `agreements`: the limits in each halving of the spacing. `probed`: whether pixels on the diagonals of
     blocks are marched with the lattice."""
     row, column = EVERY.T
     probes = (row == column) & probed
     lattice = (row % spacing == 0) & (column % spacing == 0)
-    found = [Stage(EVERY[lattice | probes], _NONE, _NOTHING)]
+    found = [MarchStage(EVERY[lattice | probes], _NONE, _NOTHING)]
     for agreement in agreements:
         half = spacing // 2
         middle = (row % spacing == half) & (column % spacing == half) & ~probes
         between = (row % half == 0) & (column % half == 0) & ((row + column) % spacing == half)
         square = half * np.array([(-1, -1), (-1, 1), (1, -1), (1, 1)])
         diamond = half * np.array([(-1, 0), (0, -1), (0, 1), (1, 0)])
-        found += [Stage(EVERY[middle], square, agreement), Stage(EVERY[between], diamond, agreement)]
+        found += [
+            MarchStage(EVERY[middle], square, agreement),
+            MarchStage(EVERY[between], diamond, agreement),
+        ]
         spacing = half
     return tuple(found)
 
@@ -118,7 +121,7 @@ def _agreement(levels: float) -> Agreement:
 
 
 def interpolate(
-    planes: Planes, size: tuple[int, int], pixels: Pixels, stage: Stage, transparent: bool
+    planes: Planes, size: tuple[int, int], pixels: Pixels, stage: MarchStage, transparent: bool
 ) -> np.ndarray:
     """Interpolate the pixels of a stage whose neighbours agree, and write them into the planes of a picture.
 

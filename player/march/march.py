@@ -32,7 +32,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from player.asset.grid import MAX_DISTANCE, Found, SparseGrid
+from player.asset.grid import MAX_DISTANCE, LocatedPoints, SparseGrid
 from player.march.box import ONE, Bounds
 from player.march.fetches import Samples, fetch_features
 from player.march.path import Path, path_of
@@ -169,7 +169,7 @@ class Chunk(NamedTuple):
     alike."""
     s: np.ndarray
     """[n_samples] float32: positions on the rays."""
-    found: Found
+    found: LocatedPoints
     """The cells that the samples are in."""
     after: np.ndarray
     """[n] int32: the base step with which each ray goes on after the chunk."""
@@ -182,7 +182,7 @@ def _chunk(grid: SparseGrid, path: Path, ray: np.ndarray, i: np.ndarray) -> Chun
     found, after = grid.find(g), i + len(CHUNK)
     if grid.level_steps[-1] == 1:
         row, column = np.divmod(np.arange(steps.size), len(CHUNK))
-        flat = Found(*(array.reshape(*array.shape[:-2], -1) for array in found))
+        flat = LocatedPoints(*(array.reshape(*array.shape[:-2], -1) for array in found))
         return Chunk(row, column, steps.reshape(-1), ONE, s.reshape(-1), flat, after)
     sizes = group_size(grid, steps, found.entries)
     begins = np.zeros(steps.shape, bool)
@@ -234,7 +234,7 @@ def _take(
     at = np.flatnonzero(chunk.found.live & (chunk.s < path.length[ray][chunk.row]))
     row, column, i, s = (array[at] for array in (chunk.row, chunk.column, chunk.i, chunk.s))
     size = chunk.size[at] if chunk.size.ndim else chunk.size
-    found = Found(*(array[..., at] for array in chunk.found))
+    found = LocatedPoints(*(array[..., at] for array in chunk.found))
     code = trilinear(grid.density, found.corners, found.fractions)
     way = np.broadcast_to(path.way(ray[row], i, size), s.shape)
     optical = np.exp(grid.density_low + grid.density_slope * code) * way

@@ -24,7 +24,7 @@ from player.render import Background, March, Quality, Renderer
 from player.terminal import printable
 from player.viewer.growing import Growing, tell_what_is_missing
 from player.viewer.pages import NO_PAGES, Pages
-from player.viewer.window import Chosen, Window
+from player.viewer.window import PictureChoices, Window
 
 PORT = 8080
 PORTS = 100
@@ -166,7 +166,7 @@ def open_windows(
     """
     from player.viewer.guard import CONNECTION
 
-    chosen = Chosen(settings.samples, settings.quality, settings.background)
+    chosen = PictureChoices(settings.samples, settings.quality, settings.background)
     trained = asset_cameras(renderers[0].asset)
     focus = focus_point(trained)
     first = orbit(trained, 1)[0]

@@ -47,7 +47,7 @@ QUALITIES = ("fast while moving", "exact", "high", "fast")
 """The options of the quality control. With the first, pictures are exact when the camera stands still."""
 
 
-class Chosen(NamedTuple):
+class PictureChoices(NamedTuple):
     """The choices of the command line for pictures; None leaves a choice to the asset or the viewer."""
 
     samples: int | None
@@ -66,7 +66,7 @@ class Window:
         renderers: Sequence[Renderer],
         trained: Sequence[Camera],
         focus: np.ndarray,
-        chosen: Chosen,
+        chosen: PictureChoices,
         whole: threading.Lock,
     ) -> None:
         """`whole`: a lock for rendering a full-size picture. Only one window holds it at a time, so that

@@ -227,8 +227,8 @@ def test_hash_grid_beyond_32_bits(n_channels: int, zeros: Zeros) -> None:
         parts = [slice(int(first), int(first) + size) for first, size in zip(offsets, sizes, strict=True)]
         for part, value in zip(parts, values, strict=True):
             table[part] = value
-        levels = hash_grid.Levels(SCALES, offsets, HASHED, MASK)
-        grid = hash_grid.GridArrays(table, *levels)
+        levels = hash_grid.TableLevels(SCALES, offsets, HASHED, MASK)
+        grid = hash_grid.HashGridArrays(table, *levels)
         if n_channels == 1:
             proposals.scatter_logits(points[:, :, None], gradient[:, :1].copy(), levels, 2, grad)
             edges = np.linspace(0.1, 0.9, 17, dtype=F32)[None].repeat(60, 0)
@@ -245,7 +245,7 @@ def test_hash_grid_beyond_32_bits(n_channels: int, zeros: Zeros) -> None:
         hash_grid.scatter(points, gradient, levels, 2, grad)
         moments = zeros((n_rows, 4), F32)
         of_level, rows = np.zeros((2, max(sizes), 2), F32), np.empty((2, 8 * len(points) + 1), np.uint32)
-        pace = adam.Pace(*map(F32, (0.1, 0.9, 0.99, 1e-8)))
+        pace = adam.AdamRates(*map(F32, (0.1, 0.9, 0.99, 1e-8)))
         adam.scatter_and_step(points, gradient, grid, of_level, rows, moments, pace)
         found.append([out, *(array[part] for array in (grad, table, moments) for part in parts)])
     for ours, expected in zip(found[1], found[0], strict=True):

@@ -31,7 +31,7 @@ from player.asset.single_level import VertexBricks, from_vertices
 from player.progress import Progress
 from vfr_bake.baking.cells import Resolutions, corners_of, subdivided
 from vfr_bake.baking.coarser_levels import pyramid_beneath, values_beneath
-from vfr_bake.field.networks import Head
+from vfr_bake.field.networks import HeadNetwork
 from vfr_bake.kernels.latent_rows import LARGEST_LATENT, PARTS, PARTS_BITS
 from vfr_bake.kernels.stored_features import table
 from vfr_bake.training.model_file import Model
@@ -62,7 +62,7 @@ Parts = Iterable[tuple[slice, np.ndarray]]
 
 
 @dataclass(frozen=True, eq=False)
-class Vertices:
+class GridVertices:
     """The stored vertices of a grid, in the order of their rows on disk."""
 
     coords: np.ndarray
@@ -100,8 +100,8 @@ class Pyramids(NamedTuple):
 class Layout:
     """The stored vertices, and the coding of their densities."""
 
-    densities: Vertices
-    features: Vertices
+    densities: GridVertices
+    features: GridVertices
     step: float
     """Length of a march step, as in `StoredCells`."""
     density_range: tuple[float, float]
@@ -225,13 +225,13 @@ def features_of_field(model: Model, layout: Layout, matrix: np.ndarray) -> Parts
         yield rows, latent(model.field.features(points) @ back)
 
 
-def _chunks(vertices: Vertices, contracted: bool) -> Iterator[tuple[slice, np.ndarray]]:
+def _chunks(vertices: GridVertices, contracted: bool) -> Iterator[tuple[slice, np.ndarray]]:
     for start in range(0, len(vertices), VERTEX_CHUNK):
         rows = slice(start, min(start + VERTEX_CHUNK, len(vertices)))
         yield rows, unit_points(vertices.index[rows], vertices.resolution, contracted)
 
 
-def _corners(cells: np.ndarray, resolution: int) -> Vertices:
+def _corners(cells: np.ndarray, resolution: int) -> GridVertices:
     """Return the corners of those cells of a grid of `resolution` that lie in `cells` [n, n, n] bool.
 
     They are found and sorted slab by slab, because a whole fine grid would take gigabytes. The result is in
@@ -247,7 +247,7 @@ def _corners(cells: np.ndarray, resolution: int) -> Vertices:
         coords, masks, order = pack_vertices(index)
         parts.append((coords, masks, index[order]))
     coords, masks, index = (np.concatenate(column) for column in zip(*parts, strict=True))
-    return Vertices(coords, masks, index, resolution)
+    return GridVertices(coords, masks, index, resolution)
 
 
 def unit_points(index: np.ndarray, resolution: int, contracted: bool) -> np.ndarray:
@@ -297,7 +297,9 @@ def project(sensitivity: np.ndarray, rendered: np.ndarray, n_stored: int) -> Pro
     return Projection(basis.T @ s, inverse @ basis)
 
 
-def head_sensitivity(head: Head, rendered: np.ndarray, dirs: np.ndarray, opacity: np.ndarray) -> np.ndarray:
+def head_sensitivity(
+    head: HeadNetwork, rendered: np.ndarray, dirs: np.ndarray, opacity: np.ndarray
+) -> np.ndarray:
     """Return M [n_channels, n_channels], the mean square of the derivatives of the shown colours, at the
     `rendered` features [n, n_channels] seen along `dirs` [n, 3] with `opacity` [n]."""
     features = torch.from_numpy(rendered).requires_grad_(True)

@@ -18,13 +18,13 @@ from torch.nn.functional import gelu, hardswish
 
 from exporters.head.onnx_head import HeadWeights, Layer, Range, levels
 from player.head.graph import PAIR_LIMIT
-from vfr_bake.field.networks import Head, SphericalHarmonics
+from vfr_bake.field.networks import HeadNetwork, SphericalHarmonics
 
 ROWS_AT_ONCE = 8192
 """Rays whose colours are computed at a time."""
 
 
-def fold_head(head: Head, first_layer: np.ndarray) -> HeadWeights:
+def fold_head(head: HeadNetwork, first_layer: np.ndarray) -> HeadWeights:
     """Return the folded head, with `first_layer` [width, n_stored] in place of its first weights.
 
     The bottleneck is a linear map that is followed by the linear part of the first directional layer. Both

@@ -55,7 +55,7 @@ LONGEST_SIDE = 640
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class ComparedView:
     """A camera and those of its pixels at which pictures are compared."""
 
     camera: Camera
@@ -66,14 +66,14 @@ class View:
     """[n, 3] colours of these pixels in the photograph, 0 to 1; None if there is no photograph."""
 
 
-def compared_views(model: Model, n_views: int) -> list[View]:
+def compared_views(model: Model, n_views: int) -> list[ComparedView]:
     """Return the views whose whole pictures are witnesses, as many as MOST_PIXELS allows. If there are none,
     return `n_views` views between the training cameras."""
     witnesses = model.neutral_witnesses()
     if witnesses is None or not len(witnesses.whole):
         between = (view.transformed(model.world_from_model) for view in views_between(model, n_views, SEED))
         small = [camera.at_most(LONGEST_SIDE) for camera in between]
-        return [View(camera, np.arange(camera.width * camera.height), None) for camera in small]
+        return [ComparedView(camera, np.arange(camera.width * camera.height), None) for camera in small]
     found, numbers, n_pixels = [], witnesses.views(), 0
     for number in witnesses.whole:
         camera, rows = model.cameras[number], numbers == number
@@ -81,7 +81,7 @@ def compared_views(model: Model, n_views: int) -> list[View]:
         if found and n_pixels > MOST_PIXELS:
             break
         photograph = to_8_bit(over_background(witnesses.rgba[rows], model.background)) / 255
-        found.append(View(camera, witnesses.pixels[rows], photograph))
+        found.append(ComparedView(camera, witnesses.pixels[rows], photograph))
     return found
 
 
@@ -95,7 +95,7 @@ class Qualities(NamedTuple):
     """Most feature lookups of a ray; 0: as many as in exact pictures."""
 
 
-def fitting_qualities(asset: Asset, views: Sequence[View], error: float) -> Qualities:
+def fitting_qualities(asset: Asset, views: Sequence[ComparedView], error: float) -> Qualities:
     """Choose the settings with which `high` and `fast` pictures lose at most ALLOWED_DB.
 
     Args:
@@ -115,7 +115,7 @@ def fitting_qualities(asset: Asset, views: Sequence[View], error: float) -> Qual
 class _Played:
     """Pictures of an asset from some views, compared with its exact pictures."""
 
-    def __init__(self, renderer: Renderer, views: Sequence[View], error: float) -> None:
+    def __init__(self, renderer: Renderer, views: Sequence[ComparedView], error: float) -> None:
         self._renderer, self._asset, self._views, self._error = renderer, renderer.asset, views, error
         self._exact, self._n_exact = self._pictures("exact")
         self._errors = self._off(self._exact)

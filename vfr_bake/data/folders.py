@@ -20,7 +20,7 @@ from vfr_bake.data.capture import Capture, PosedImages, held_out
 from vfr_bake.data.files.estimate_record import read_record
 from vfr_bake.data.files.masks import mask_of
 from vfr_bake.data.files.opening import SUFFIXES
-from vfr_bake.data.files.orientation import Layout, is_taken_upright, read_layout
+from vfr_bake.data.files.orientation import PictureHeader, is_taken_upright, read_layout
 from vfr_bake.data.files.pictures import DescribedView
 from vfr_bake.data.store.reading import PictureReader
 
@@ -107,7 +107,7 @@ def _described_views(path: Path) -> list[DescribedView]:
     return [DescribedView(*view) for view in zip(paths, cameras, distortions, upright, masks, strict=True)]
 
 
-def _layout(picture: Path) -> Layout:
+def _layout(picture: Path) -> PictureHeader:
     try:
         return read_layout(picture)
     except FormatError as error:

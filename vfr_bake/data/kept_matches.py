@@ -40,7 +40,7 @@ _MATCHES = struct.Struct(f"<{STAMP}s{STAMP}sI")
 _BYTES_A_FEATURE, _BYTES_A_MATCH = 8 + 128, 8
 
 
-class Found(NamedTuple):
+class KeptFeatures(NamedTuple):
     """The features and measurements of one picture, turned upright."""
 
     width: int
@@ -128,7 +128,7 @@ class KeptMatches:
     def _matches_path(self) -> Path:
         return self._folder / "matches.bin"
 
-    def look(self, of: bytes) -> Found | None:
+    def look(self, of: bytes) -> KeptFeatures | None:
         """Return what was found in the picture with the stamp `of`; None if nothing is kept."""
         at = self._looks.get(of)
         if at is None:
@@ -139,9 +139,9 @@ class KeptMatches:
             thumbnail = np.frombuffer(file.read(SIDE * SIDE), np.uint8)
             points = np.frombuffer(file.read(8 * n), "<f4").reshape(n, 2).astype(np.float64)
             sift = np.frombuffer(file.read(128 * n), np.uint8).reshape(n, 128)
-        return Found(width, height, Features(points, sift), thumbnail, sharpness)
+        return KeptFeatures(width, height, Features(points, sift), thumbnail, sharpness)
 
-    def keep_look(self, of: bytes, look: Found) -> None:
+    def keep_look(self, of: bytes, look: KeptFeatures) -> None:
         """Keep what was found in the picture with the stamp `of`."""
         points, sift = look.features.points.astype("<f4"), look.features.sift
         header = _LOOK.pack(of, look.sharpness, look.width, look.height, len(points))
@@ -180,7 +180,8 @@ class KeptMatches:
             except OSError as error:
                 self._give_up(error.strerror or str(error))
                 return
-            index[key], self._ends[path] = at, (at + len(record),) * 2
+            end = at + len(record)
+            index[key], self._ends[path] = at, (end, end)
 
     def remove(self) -> None:
         """Delete the folder."""

@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from vfr_bake.config import FieldConfig
 from vfr_bake.field.hash_grid import HashGrid
-from vfr_bake.field.networks import DensityNetwork, Head
+from vfr_bake.field.networks import DensityNetwork, HeadNetwork
 from vfr_bake.kernels.density import LARGEST_LOGIT, FieldArrays, density_logits
 
 
@@ -20,7 +20,7 @@ class VfrField(nn.Module):
         self.config = config
         self.grid = HashGrid(config)
         self.density = DensityNetwork(config.n_channels, config.density_width)
-        self.head = Head(config)
+        self.head = HeadNetwork(config)
 
     def arrays(self) -> FieldArrays:
         """Return grid and density network as the kernels take them, for a field on a CPU."""

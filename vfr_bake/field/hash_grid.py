@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from vfr_bake.config import FieldConfig
 from vfr_bake.kernels import hash_grid as kernels
-from vfr_bake.kernels.hash_grid import GridArrays, Levels
+from vfr_bake.kernels.hash_grid import HashGridArrays, TableLevels
 from vfr_bake.torch_kernels.hash_grid import features_at
 
 Backend = Literal["numba", "torch"]
@@ -64,27 +64,27 @@ class GridLayout:
         self.hashed = np.array([n > size for n in vertices])
         self.offsets = np.concatenate([[0], np.cumsum([min(n, size) for n in vertices])]).astype(np.int64)
         self.mask = size - 1
-        self._levels: dict[tuple[torch.device, torch.dtype], Levels] = {}
+        self._levels: dict[tuple[torch.device, torch.dtype], TableLevels] = {}
 
     @property
     def n_entries(self) -> int:
         return int(self.offsets[-1])
 
-    def arrays(self, dtype: np.dtype | type) -> Levels:
+    def arrays(self, dtype: np.dtype | type) -> TableLevels:
         """Return the levels as numba's kernels take them, for a table of type `dtype`."""
-        return Levels(np.array(self.resolutions, dtype), self.offsets, self.hashed, self.mask)
+        return TableLevels(np.array(self.resolutions, dtype), self.offsets, self.hashed, self.mask)
 
-    def grid(self, table: Tensor) -> GridArrays:
+    def grid(self, table: Tensor) -> HashGridArrays:
         """Return the table, which is on a CPU, with its levels, as numba's kernels take them."""
         array = table.detach().numpy()
-        return GridArrays(array, *self.arrays(array.dtype))
+        return HashGridArrays(array, *self.arrays(array.dtype))
 
-    def levels(self, table: Tensor) -> Levels:
+    def levels(self, table: Tensor) -> TableLevels:
         """Return the levels as torch's kernels take them, on the device and in the type of `table`; they are
         made once for each device and type."""
         place = (table.device, table.dtype)
         if place not in self._levels:
-            self._levels[place] = Levels(
+            self._levels[place] = TableLevels(
                 scales=torch.tensor(self.resolutions, dtype=table.dtype, device=table.device),
                 offsets=torch.from_numpy(self.offsets).to(table.device),
                 hashed=torch.from_numpy(self.hashed).to(table.device),

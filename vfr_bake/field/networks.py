@@ -127,7 +127,7 @@ class SphericalHarmonics(nn.Module):
         return monomials @ self.coefficients.to(dirs.dtype)
 
 
-class Head(nn.Module):
+class HeadNetwork(nn.Module):
     """The head: rgb = head(sum w_i F_i, d).
 
     >>> head = Head(FieldConfig(n_levels=2, head_width=8))

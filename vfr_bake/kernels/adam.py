@@ -17,7 +17,7 @@ AHEAD = 16
 step."""
 
 
-class Pace(NamedTuple):
+class AdamRates(NamedTuple):
     """Learning rate and decay rates of one step."""
 
     rate: np.float32
@@ -30,10 +30,10 @@ class Pace(NamedTuple):
 
 
 @njit(inline="always")
-def _step_row(row, table, moments, grad_row, grad, pace):
+def _step_row(row, table, moments, grad_row, grad, rates):
     """Step `table[row]` along `grad[grad_row]`, and clear that gradient. `moments[row]` holds the moving
     means of the gradient, followed by those of its square."""
-    rate, beta1, beta2, epsilon = pace
+    rate, beta1, beta2, epsilon = rates
     one = table.dtype.type(1)
     n = table.shape[1]
     for c in range(n):
@@ -47,7 +47,7 @@ def _step_row(row, table, moments, grad_row, grad, pace):
 
 
 @njit(parallel=True, cache=True, fastmath=FLAGS, error_model="numpy")
-def adam_step(table, grad, moments, pace):
+def adam_step(table, grad, moments, rates):
     """Step the rows of `table` [n_entries, n_channels] that have a gradient, in place, and clear the
     gradient. `grad` has the table's shape, `moments` is [n_entries, 2 * n_channels].
 
@@ -59,11 +59,11 @@ def adam_step(table, grad, moments, pace):
         for c in range(n):
             touched |= grad[row, c] != 0
         if touched:
-            _step_row(row, table, moments, row, grad, pace)
+            _step_row(row, table, moments, row, grad, rates)
 
 
 @njit(parallel=True, cache=True, fastmath=FLAGS, error_model="numpy")
-def scatter_and_step(points, grad_features, grid, grad, rows, moments, pace):
+def scatter_and_step(points, grad_features, grid, grad, rows, moments, rates):
     """Do what `hash_grid.scatter` and `adam_step` do, level by level, so that a level's gradient is still in
     the cache when its rows are stepped.
 
@@ -85,4 +85,4 @@ def scatter_and_step(points, grad_features, grid, grad, rows, moments, pace):
                 prefetch(table, ahead)
                 prefetch(moments, ahead)
                 row = np.uint64(rows[thread, i])
-                _step_row(first + row, table, moments, row, grad[thread], pace)
+                _step_row(first + row, table, moments, row, grad[thread], rates)

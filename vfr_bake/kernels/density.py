@@ -44,7 +44,7 @@ class DensityArrays(NamedTuple):
 
 
 class FieldArrays(NamedTuple):
-    """Field in the form that kernels take: the members of its `GridArrays` and of its `DensityArrays`."""
+    """Field in the form that kernels take: the members of its `HashGridArrays` and of its `DensityArrays`."""
 
     table: np.ndarray
     scales: np.ndarray

@@ -31,7 +31,7 @@ AHEAD = 4
 """Number of points by which the rows that a gradient is added to are prefetched ahead."""
 
 
-class Levels(NamedTuple):
+class TableLevels(NamedTuple):
     """Levels of a table, and which of its rows belong to each: arrays for numba, tensors for torch."""
 
     scales: Any
@@ -44,7 +44,7 @@ class Levels(NamedTuple):
     """Number of entries of a hashed level, which is a power of two, minus one."""
 
 
-class GridArrays(NamedTuple):
+class HashGridArrays(NamedTuple):
     """Hash grid in the form that kernels take."""
 
     table: np.ndarray
@@ -53,7 +53,8 @@ class GridArrays(NamedTuple):
     offsets: np.ndarray
     hashed: np.ndarray
     mask: int
-    """This member and the three before it are those of `Levels`: a parallel kernel takes no nested tuples."""
+    """This member and the three before it are those of `TableLevels`: a parallel kernel takes no nested
+    tuples."""
 
 
 @njit(inline="always")

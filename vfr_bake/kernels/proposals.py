@@ -17,7 +17,7 @@ from numba import prange
 from player.compiled.lanes import LANES
 from vfr_bake.kernels import njit
 from vfr_bake.kernels.density import density_logit
-from vfr_bake.kernels.hash_grid import FLAGS, GridArrays, corners
+from vfr_bake.kernels.hash_grid import FLAGS, HashGridArrays, corners
 from vfr_bake.kernels.ray_lanes import look_up_lanes, propose_lanes
 
 PADDING = 1e-3
@@ -152,7 +152,7 @@ def field_samples(rays_o, rays_d, edges, field, limits, counts, t_mid, deltas, p
     n = edges.shape[1] - 1
     block = 16
     n_rays = rays_o.shape[0]
-    grid = GridArrays(field.table, field.scales, field.offsets, field.hashed, field.mask)
+    grid = HashGridArrays(field.table, field.scales, field.offsets, field.hashed, field.mask)
     for start in prange((n_rays + block - 1) // block):
         hidden = np.zeros(field.b1.shape[0], edges.dtype)
         places = np.empty((5, LANES), edges.dtype)

@@ -9,13 +9,13 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from vfr_bake.kernels.hash_grid import PRIME_Y, PRIME_Z, Levels
+from vfr_bake.kernels.hash_grid import PRIME_Y, PRIME_Z, TableLevels
 from vfr_bake.torch_kernels import fast
 
 _PRIME_Y, _PRIME_Z = int(PRIME_Y), int(PRIME_Z)  # torch's compiler takes a numpy number for a tensor
 
 
-def corners(points: Tensor, levels: Levels) -> tuple[Tensor, Tensor]:
+def corners(points: Tensor, levels: TableLevels) -> tuple[Tensor, Tensor]:
     """Return (rows, trilinear weights), both [n_points, n_levels, 8] with x fastest, of the corners around
     `points` [n_points, 3] of the unit cube."""
     position = points[:, None, :] * levels.scales[:, None]
@@ -36,14 +36,14 @@ def corners(points: Tensor, levels: Levels) -> tuple[Tensor, Tensor]:
     return rows.flatten(2), products.flatten(2)
 
 
-def encode(points: Tensor, table: Tensor, levels: Levels) -> Tensor:
+def encode(points: Tensor, table: Tensor, levels: TableLevels) -> Tensor:
     """Return the features [n_points, n_levels * n_channels] at `points` [n_points, 3] of the unit cube, from
     `table` [n_entries, n_channels]."""
     rows, weights = corners(points, levels)
     return (weights[..., None] * table[rows]).sum(dim=2).flatten(1)
 
 
-def scatter(points: Tensor, gradient: Tensor, n_entries: int, levels: Levels) -> Tensor:
+def scatter(points: Tensor, gradient: Tensor, n_entries: int, levels: TableLevels) -> Tensor:
     """Return the table's gradient [n_entries, n_channels], given that of `encode`
     [n_points, n_levels * n_channels].
 
@@ -58,7 +58,7 @@ def scatter(points: Tensor, gradient: Tensor, n_entries: int, levels: Levels) ->
     return total.index_add(0, entries.flatten(), values.flatten()).reshape(n_entries, n_channels)
 
 
-def features_at(points: Tensor, table: Tensor, levels: Levels, features: Tensor | None = None) -> Tensor:
+def features_at(points: Tensor, table: Tensor, levels: TableLevels, features: Tensor | None = None) -> Tensor:
     """Encode as `encode` does, differentiably with respect to `table` alone. If the `features` are known
     already, they are returned as they are, with the same gradient."""
     return _Features.apply(points, table, levels, features)  # type: ignore[return-value]
@@ -66,7 +66,7 @@ def features_at(points: Tensor, table: Tensor, levels: Levels, features: Tensor 
 
 class _Features(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, points: Tensor, table: Tensor, levels: Levels, features: Tensor | None) -> Tensor:
+    def forward(ctx, points: Tensor, table: Tensor, levels: TableLevels, features: Tensor | None) -> Tensor:
         ctx.save_for_backward(points)
         ctx.levels, ctx.n_entries = levels, len(table)
         if features is not None:

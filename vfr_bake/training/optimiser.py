@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.optim.adam import adam
 
 from vfr_bake.field.hash_grid import HashGrid, zeros
-from vfr_bake.kernels.adam import Pace, adam_step, scatter_and_step
+from vfr_bake.kernels.adam import AdamRates, adam_step, scatter_and_step
 
 BETAS, EPSILON = (0.9, 0.99), 1e-15
 """Adam's decay rates, and what is added to its denominator; both as in instant-ngp."""
@@ -176,17 +176,17 @@ class GridAdam(TableAdam):
 
     def step(self, rate: float) -> None:
         arrays = (a.numpy() for a in (self.table.detach(), self.gradient, self.moments))
-        adam_step(*arrays, self._next_pace(rate))
+        adam_step(*arrays, self._next_rates(rate))
 
     def clear(self) -> None:
         self.gradient.zero_()
 
-    def _next_pace(self, rate: float) -> Pace:
+    def _next_rates(self, rate: float) -> AdamRates:
         """Count a step, and return its rate and decay rates."""
         self.n_steps += 1
         beta1, beta2 = GRID_BETAS
         correction = float(np.sqrt(1 - beta2**self.n_steps)) / (1 - beta1**self.n_steps)
-        return Pace(*map(np.float32, (rate * correction, beta1, beta2, EPSILON)))
+        return AdamRates(*map(np.float32, (rate * correction, beta1, beta2, EPSILON)))
 
     def state(self) -> dict[str, Any]:
         return {"moments": self.moments, "n_steps": self.n_steps}
@@ -223,7 +223,7 @@ class FusedGridAdam(GridAdam):
             self._rows = np.empty((get_num_threads(), 8 * len(points) + 1), np.uint32)
         scatter_and_step(
             points.numpy(), gradient.numpy(), self._grid.layout.grid(self.table), self._buffer.numpy(),
-            self._rows, self.moments.numpy(), self._next_pace(rate),
+            self._rows, self.moments.numpy(), self._next_rates(rate),
         )  # fmt: skip
         self._pending.clear()
 

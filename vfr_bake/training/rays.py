@@ -50,7 +50,7 @@ class Batch(RayBatch):
     """[n_rays] in [0, 1): decides whether a ray with a small error is learned from."""
 
 
-class Pixels(NamedTuple):
+class PicturePixels(NamedTuple):
     """Pixels of all pictures, which may differ in size: all of them, or one chunk of those on a disk
     (`vfr_bake.data.capture.StoredImages`). The members are arrays, or tensors on one device."""
 
@@ -75,7 +75,7 @@ class Pixels(NamedTuple):
     """[n_pictures, 4] float32: fx, fy, cx, cy in pixels."""
 
     @classmethod
-    def of(cls, views: PosedImages, joined: np.ndarray | None, chunk: int) -> Pixels:
+    def of(cls, views: PosedImages, joined: np.ndarray | None, chunk: int) -> PicturePixels:
         """Return the pixels of `views`: `joined` [n_pixels, 4] if they are in memory, a `chunk` if on a
         disk."""
         cameras, images = views.cameras, views.images
@@ -205,7 +205,7 @@ class PixelSampler:
         """Make `chunk` the current one, or else the next one that has something to draw."""
         for ahead in range(self._n_chunks):
             self._chunk = (chunk + ahead) % self._n_chunks
-            self._pixels = Pixels.of(self._views, self._joined, self._chunk)
+            self._pixels = PicturePixels.of(self._views, self._joined, self._chunk)
             self._lottery = self._new_lottery()
             if self._lottery.n_lots:
                 self._n_left = max(1, int(CHUNK_SHARE * self._lottery.n_lots))
@@ -260,7 +260,7 @@ class DevicePixelSampler(PixelSampler):
     def _go_to(self, chunk: int) -> None:
         super()._go_to(chunk)
         device = self._generator.device
-        self._pixels = Pixels(*(torch.from_numpy(array).to(device) for array in self._pixels))
+        self._pixels = PicturePixels(*(torch.from_numpy(array).to(device) for array in self._pixels))
         self._lottery.to(device)
 
     def draw(self, n_rays: int) -> RayBatch:
@@ -287,9 +287,9 @@ def _joined(of_views: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     return views, np.concatenate([np.zeros(0, np.int64), *of_views])
 
 
-def _indices(pixels: Pixels, view: np.ndarray, number: np.ndarray) -> np.ndarray:
+def _indices(pixels: PicturePixels, view: np.ndarray, number: np.ndarray) -> np.ndarray:
     """Return the indices int64 in `pixels` of the pixels with these row-major numbers [n] in the pictures
-    `view` [n], without those that are not there; the inverse of `Pixels.numbers`."""
+    `view` [n], without those that are not there; the inverse of `PicturePixels.numbers`."""
     strides = zip(pixels.strides.tolist(), pixels.sizes.tolist(), strict=True)
     inverse = np.array([pow(stride, -1, size) for stride, size in strides], np.int64)
     place = number * inverse[view] % pixels.sizes[view] - pixels.places[view]

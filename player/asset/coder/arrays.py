@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from player.asset.coder.lanes import Lanes
+from player.asset.coder.lanes import RowsToLanes
 from player.asset.coder.tables import (
     BITS,
     CONTEXT_OF_SUM,
@@ -15,7 +15,7 @@ from player.asset.coder.tables import (
     N_MIXED,
     SYMBOL_BITS,
     TOTAL,
-    Lookup,
+    DecoderTables,
 )
 
 _PLACE, _COUNT, _FIRST = np.uint32(TOTAL - 1), np.uint32(BITS), np.uint32(0xFFFF)
@@ -49,7 +49,7 @@ def decode_channel(
     words: np.ndarray,
     at: int,
     states: np.ndarray,
-    lookup: Lookup,
+    lookup: DecoderTables,
     of_context: np.ndarray,
     classes: np.ndarray,
     neighbours: np.ndarray,
@@ -69,7 +69,7 @@ def decode_channel(
         [n] int16 symbols by row; and the number of words taken now, or -1 if there are too few.
     """
     n, n_lanes = len(classes), len(states)
-    n_words, lanes = len(words) - n_lanes, Lanes(n, n_lanes)
+    n_words, lanes = len(words) - n_lanes, RowsToLanes(n, n_lanes)
     table_of_sum = of_context[:, CONTEXT_OF_SUM].reshape(-1)
     row = np.concatenate([runs[:, 0] for runs in lanes.runs(np.arange(n))])  # the first of each run
     found, near = np.empty(n, np.uint8), np.zeros(n + 1, np.int16)

@@ -32,7 +32,7 @@ from types import ModuleType
 
 import numpy as np
 
-from player.asset.coder.lanes import Lanes, Neighbours
+from player.asset.coder.lanes import Neighbours, RowsToLanes
 from player.asset.coder.tables import (
     CONTEXT_OF_SUM,
     END,
@@ -84,11 +84,11 @@ def encode(
     if not symbols.size:
         return b""
     rows = np.clip(symbols.T, -END, END).astype(np.int8)
-    lanes = Lanes(n, min(max(n >> 8, 1), _MOST_CODED))
+    lanes = RowsToLanes(n, min(max(n >> 8, 1), _MOST_CODED))
     found, n_bits = _fit(rows, neighbours.known(lanes), classes, n_classes)
     fewer = max(min(lanes.n_lanes, int(n_bits) // _LANE_BITS), n >> 12, 1)
     if fewer < lanes.n_lanes:
-        lanes = Lanes(n, fewer)
+        lanes = RowsToLanes(n, fewer)
         found, _ = _fit(rows, neighbours.known(lanes), classes, n_classes)
     known = neighbours.known(lanes)
     states, words = np.full(lanes.n_lanes, LOW, np.uint32), []
@@ -202,7 +202,7 @@ class Decoder:
         self._beyond = np.frombuffer(data, np.uint8, offset=end)
         if (self._beyond > MAX_SYMBOL - END).any():
             raise FormatError(f"{where}: symbols: expected magnitudes up to {MAX_SYMBOL}, got more")
-        self._lanes = Lanes(n, n_lanes)
+        self._lanes = RowsToLanes(n, n_lanes)
 
     def channel(self, classes: np.ndarray) -> np.ndarray:
         """Decode the symbols [n] int16 of the next channel with classes [n] uint8. Raises FormatError."""

@@ -14,7 +14,7 @@ from player.asset.coder.tables import (
     N_MIXED,
     SYMBOL_BITS,
     TOTAL,
-    Lookup,
+    DecoderTables,
 )
 from player.compiling import compiled
 from player.scratch import check_scratch, scratch
@@ -51,7 +51,7 @@ def decode_channel(
     words: np.ndarray,
     at: int,
     states: np.ndarray,
-    lookup: Lookup,
+    lookup: DecoderTables,
     of_context: np.ndarray,
     classes: np.ndarray,
     neighbours: np.ndarray,

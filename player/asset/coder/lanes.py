@@ -13,7 +13,7 @@ import numpy as np
 
 
 @dataclass(frozen=True)
-class Lanes:
+class RowsToLanes:
     """The dealing of n rows to lanes."""
 
     n: int
@@ -76,13 +76,13 @@ class Neighbours:
     rows: np.ndarray
     """[3, n] int32: the rows of each row's neighbours, -1 for a neighbour that does not exist. In a grid they
     are the next vertices along -z, -y and -x."""
-    _kept: dict[Lanes, np.ndarray] = field(default_factory=dict, repr=False)
+    _kept: dict[RowsToLanes, np.ndarray] = field(default_factory=dict, repr=False)
 
     @property
     def n(self) -> int:
         return self.rows.shape[1]
 
-    def in_order(self, lanes: Lanes) -> np.ndarray:
+    def in_order(self, lanes: RowsToLanes) -> np.ndarray:
         """Return the neighbours [3, n] uint32 of the rows in the order of coding, n for a neighbour that does
         not exist. The last result is cached."""
         found = self._kept.get(lanes)
@@ -93,7 +93,7 @@ class Neighbours:
             self._kept[lanes] = found
         return found
 
-    def known(self, lanes: Lanes) -> np.ndarray:
+    def known(self, lanes: RowsToLanes) -> np.ndarray:
         """Return [3, n] int32: each row's neighbours that are coded at an earlier step, n for others."""
         n, step = np.int32(self.n), np.append(lanes.step(), np.int32(self.n))
         return np.stack([np.where(step[rows] < step[:-1], rows, n) for rows in self.rows])

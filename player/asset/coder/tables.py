@@ -81,7 +81,7 @@ CONTEXT_OF_SUM = _contexts_of_sums()
 """[N_MIXED] uint8: the context, at the index that is the sum of the neighbours' `mixed` symbols and 64."""
 
 
-class Lookup(NamedTuple):
+class DecoderTables(NamedTuple):
     """Tables in the form that a decoder reads."""
 
     symbols: np.ndarray
@@ -98,13 +98,13 @@ class Tables(NamedTuple):
     of_context: np.ndarray
     """[n_channels, n_classes, 81] uint8: the table of each context."""
 
-    def lookup(self) -> Lookup:
+    def lookup(self) -> DecoderTables:
         """Return the tables in the form that a decoder reads."""
         first = np.cumsum(self.counts, axis=1, dtype=np.uint32) - self.counts
         places = np.zeros((len(self.counts), 1 << SYMBOL_BITS), np.uint32)
         places[:, :N_SYMBOLS] = (self.counts.astype(np.uint32) << 16) | first
         symbols = np.tile(np.arange(N_SYMBOLS, dtype=np.uint8), len(self.counts))
-        return Lookup(symbols.repeat(self.counts.reshape(-1)), places.reshape(-1))
+        return DecoderTables(symbols.repeat(self.counts.reshape(-1)), places.reshape(-1))
 
     def packed(self) -> bytes:
         """Return the tables as bytes: a zlib stream of the table index of each context, the number of tables,

@@ -16,7 +16,7 @@ from player.cameras.camera import Camera
 from player.cameras.transforms import read_cameras
 from player.compiled import interpolation as compiled
 from player.march.bounds import BLOCK
-from player.march.interpolation import Agreement, Quality, Stage, interpolate, stages
+from player.march.interpolation import Agreement, MarchStage, Quality, interpolate, stages
 from player.march.pixels import Pixels, Planes, pixels_of_blocks
 from player.render import Frame, Renderer
 from tests.numerics.bounds import Row
@@ -27,7 +27,7 @@ QUALITIES: tuple[Quality, ...] = ("exact", "high", "fast")
 LOSSY = QUALITIES[1:]
 
 
-def usual_stages(quality: Quality, contracted: bool = False) -> tuple[Stage, ...]:
+def usual_stages(quality: Quality, contracted: bool = False) -> tuple[MarchStage, ...]:
     """Return the stages of a picture whose asset's manifest has no `agreement`."""
     return stages(dict(zip(QUALITIES, (0.0, *AGREEMENT[contracted]), strict=True))[quality], contracted)
 
@@ -80,7 +80,7 @@ def random_planes(n_pixels: int, random: np.random.Generator) -> Planes:
     return Planes(rgb, opacity, depth, np.zeros(n_pixels, np.int32))
 
 
-def all_pixels(width: int, height: int, stage: Stage) -> Pixels:
+def all_pixels(width: int, height: int, stage: MarchStage) -> Pixels:
     per_row = -(-width // BLOCK)
     blocks = np.arange(per_row * -(-height // BLOCK))
     camera = Camera("", np.eye(4), width, height, 1.0, 1.0, 0.5, 0.5)
@@ -88,7 +88,7 @@ def all_pixels(width: int, height: int, stage: Stage) -> Pixels:
 
 
 def expected_pixel(
-    planes: Planes, size: tuple[int, int], row: int, column: int, stage: Stage, transparent: bool
+    planes: Planes, size: tuple[int, int], row: int, column: int, stage: MarchStage, transparent: bool
 ) -> tuple[float, ...] | None:
     """Return r, g, b, opacity and depth of a pixel in float64; None if it is to be marched."""
     width, height = size

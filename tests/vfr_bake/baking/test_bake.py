@@ -51,7 +51,7 @@ from vfr_bake.baking.refinement import (
 )
 from vfr_bake.config import BakeConfig, FieldConfig
 from vfr_bake.data import demo
-from vfr_bake.field.networks import Head
+from vfr_bake.field.networks import HeadNetwork
 from vfr_bake.kernels.latent_rows import PARTS
 from vfr_bake.presets import PRESETS
 from vfr_bake.rendering.render import render_image
@@ -103,7 +103,7 @@ def test_projection_is_the_best_of_its_rank() -> None:
 
 def test_sensitivity_is_the_mean_square_of_finite_differences() -> None:
     torch.manual_seed(0)
-    head = Head(FieldConfig(n_levels=2, head_width=16)).double()
+    head = HeadNetwork(FieldConfig(n_levels=2, head_width=16)).double()
     random = np.random.default_rng(0)
     features, opacity = random.normal(size=(30, 4)), random.random(30)
     dirs = torch.nn.functional.normalize(torch.randn(30, 3, dtype=torch.float64), dim=-1).numpy()
@@ -159,7 +159,7 @@ def test_coarse_pictures_leave_no_hole_in_a_fine_grid(model: Model, fine: tuple[
 
 def test_folded_head_equals_the_head() -> None:
     torch.manual_seed(0)
-    head = Head(FieldConfig(n_levels=6, head_width=24, sh_degree=3, n_sh_features=2))
+    head = HeadNetwork(FieldConfig(n_levels=6, head_width=24, sh_degree=3, n_sh_features=2))
     scales = np.linspace(0.5, 2, 12)
     first = head.spatial[0].weight.detach().double().numpy() * scales
     session = onnxruntime.InferenceSession(head_onnx(fold_head(head, first)))
@@ -192,7 +192,7 @@ def training_rays_of(dirs: np.ndarray, wanted: np.ndarray) -> TrainingRays:
 def test_refinement_brings_the_head_back_to_its_teacher(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("vfr_bake.baking.refinement.HEAD_BATCH", BATCH)  # to have the same rays
     torch.manual_seed(0)
-    head = Head(FieldConfig(n_levels=6, head_width=24))
+    head = HeadNetwork(FieldConfig(n_levels=6, head_width=24))
     weights = fold_head(head, head.first_weights() * 0.02)
     codes = torch.rand(4000, 12) * 254 - 127
     dirs = torch.nn.functional.normalize(torch.randn(4000, 3), dim=-1)

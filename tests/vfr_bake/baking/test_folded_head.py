@@ -15,14 +15,14 @@ from player.head.graph import Activation
 from vfr_bake.baking.head import FoldedHead, fold_head, runner
 from vfr_bake.baking.refinement import HEAD_RATE, Steps, Stored, train_head
 from vfr_bake.config import FieldConfig
-from vfr_bake.field.networks import Head
+from vfr_bake.field.networks import HeadNetwork
 
 from .test_bake import training_rays_of
 
 
 def folded() -> HeadWeights:
     torch.manual_seed(0)
-    head = Head(FieldConfig(n_levels=6, head_width=24, sh_degree=3, n_sh_features=2))
+    head = HeadNetwork(FieldConfig(n_levels=6, head_width=24, sh_degree=3, n_sh_features=2))
     return fold_head(head, head.first_weights() * 0.01)
 
 

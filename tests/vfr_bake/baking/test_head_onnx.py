@@ -25,7 +25,7 @@ from tests.exporters.formats import block
 from tests.numerics.bounds import Row
 from vfr_bake.baking.head import fold_head
 from vfr_bake.config import FieldConfig
-from vfr_bake.field.networks import Head, SphericalHarmonics
+from vfr_bake.field.networks import HeadNetwork, SphericalHarmonics
 
 EXPORTED = "The exported head"
 FLOAT32 = Row(
@@ -49,13 +49,13 @@ SCALE = 0.02
 
 
 @pytest.fixture(scope="module")
-def head() -> Head:
+def head() -> HeadNetwork:
     torch.manual_seed(5)
-    return Head(FieldConfig(n_levels=N_CHANNELS // 2)).double()
+    return HeadNetwork(FieldConfig(n_levels=N_CHANNELS // 2)).double()
 
 
 @pytest.fixture(scope="module")
-def weights(head: Head) -> HeadWeights:
+def weights(head: HeadNetwork) -> HeadWeights:
     return fold_head(head, head.first_weights() * SCALE)
 
 
@@ -91,7 +91,7 @@ def answers(session: onnxruntime.InferenceSession) -> list[tuple[str, np.ndarray
 
 @pytest.mark.parametrize("decode", [False, True], ids=["head", "decode and head"])
 def test_float32_is_the_trained_head(
-    decode: bool, head: Head, weights: HeadWeights, asset: Asset, tmp_path: Path
+    decode: bool, head: HeadNetwork, weights: HeadWeights, asset: Asset, tmp_path: Path
 ) -> None:
     """The exported float32 head is the trained one within 2e-6: sums of 256 float32 products, of which a
     quarter passes the sigmoid. If features are so large that logits of hundreds cancel, 2^-24 of the largest
@@ -111,7 +111,7 @@ def test_float32_is_the_trained_head(
 
 @pytest.mark.parametrize("decode", [False, True], ids=["head", "decode and head"])
 def test_int8_is_torch_s_quantisation(
-    decode: bool, head: Head, weights: HeadWeights, asset: Asset, tmp_path: Path
+    decode: bool, head: HeadNetwork, weights: HeadWeights, asset: Asset, tmp_path: Path
 ) -> None:
     """The exported 8-bit head is torch's quantisation within 5e-3: an activation in the middle of two levels
     may go either way, which moves a colour by a level of one of 256 activations, and there may be two or

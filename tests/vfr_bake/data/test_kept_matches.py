@@ -11,19 +11,19 @@ import numpy as np
 import pytest
 
 from vfr_bake.data.features import Features
-from vfr_bake.data.kept_matches import MOST_SECONDS, SIDE, Found, KeptMatches, stamp
+from vfr_bake.data.kept_matches import MOST_SECONDS, SIDE, KeptFeatures, KeptMatches, stamp
 
 A, B, C = (bytes([number]) * 16 for number in range(3))
 
 
-def made(seed: int, n: int) -> Found:
+def made(seed: int, n: int) -> KeptFeatures:
     rng = np.random.default_rng(seed)
     points = rng.uniform(0, 4000, (n, 2)).astype(np.float32).astype(np.float64)
     features = Features(points, rng.integers(0, 256, (n, 128), np.uint8))
-    return Found(4000, 3000, features, rng.integers(0, 256, SIDE * SIDE, np.uint8), rng.uniform())
+    return KeptFeatures(4000, 3000, features, rng.integers(0, 256, SIDE * SIDE, np.uint8), rng.uniform())
 
 
-def same(a: Found | None, b: Found) -> bool:
+def same(a: KeptFeatures | None, b: KeptFeatures) -> bool:
     return (
         a is not None
         and (a.width, a.height, a.sharpness) == (b.width, b.height, b.sharpness)

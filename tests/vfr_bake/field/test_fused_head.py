@@ -10,7 +10,7 @@ import torch
 
 from tests.numerics.bounds import Row
 from vfr_bake.config import FieldConfig
-from vfr_bake.field.networks import Head
+from vfr_bake.field.networks import HeadNetwork
 from vfr_bake.kernels import njit
 from vfr_bake.kernels.head import bfloat16
 from vfr_bake.kernels.head.activations import (
@@ -175,7 +175,7 @@ def test_relu_backward_matches_autograd(dtype: type) -> None:
 
 
 def gradients(
-    head: Head, features: torch.Tensor, dirs: torch.Tensor, wanted: torch.Tensor
+    head: HeadNetwork, features: torch.Tensor, dirs: torch.Tensor, wanted: torch.Tensor
 ) -> list[torch.Tensor]:
     """Return the colours, and the gradients of features and parameters, for a gradient `wanted` of them."""
     features = features.clone().requires_grad_()
@@ -193,7 +193,7 @@ def test_fused_head_matches_float64(n_rays: int, n_layers: int) -> None:
     config = FieldConfig(
         n_levels=3, head_width=20, sh_degree=3, n_sh_features=2, n_directional_layers=n_layers
     )
-    head, exact = Head(config), Head(config).double()
+    head, exact = HeadNetwork(config), HeadNetwork(config).double()
     for parameter in head.parameters():
         torch.nn.init.normal_(parameter, std=0.4)
     exact.load_state_dict(head.state_dict())
@@ -223,7 +223,7 @@ def without_onednn() -> Iterator[None]:
 def test_fused_head_in_bfloat16_is_near_float64() -> None:
     torch.manual_seed(0)
     config = FieldConfig(n_levels=4, head_width=64, sh_degree=3, n_sh_features=2)
-    head, exact = Head(config), Head(config).double()
+    head, exact = HeadNetwork(config), HeadNetwork(config).double()
     exact.load_state_dict(head.state_dict())
     features, wanted = torch.randn(200, 8), torch.randn(200, 3)
     wanted[1::3] = 0
@@ -244,7 +244,7 @@ def test_fused_head_in_bfloat16_is_near_float64() -> None:
 
 @pytest.mark.usefixtures("without_onednn")
 def test_products_in_bfloat16_have_few_sizes(monkeypatch: pytest.MonkeyPatch) -> None:
-    head = Head(FieldConfig(n_levels=2, head_width=8))
+    head = HeadNetwork(FieldConfig(n_levels=2, head_width=8))
     head.products = torch.bfloat16
     multiply, sizes = torch.mm, set[tuple[torch.Size, torch.Size]]()
 
@@ -266,7 +266,7 @@ def test_products_in_bfloat16_have_few_sizes(monkeypatch: pytest.MonkeyPatch) ->
 @pytest.mark.usefixtures("without_onednn")
 @pytest.mark.parametrize("products", [torch.float32, torch.bfloat16])
 def test_fused_head_takes_nothing_and_keeps_nan(products: torch.dtype) -> None:
-    head = Head(FieldConfig(n_levels=2, head_width=8))
+    head = HeadNetwork(FieldConfig(n_levels=2, head_width=8))
     head.products = products
     none = gradients(head, torch.empty(0, 4), torch.empty(0, 3), torch.empty(0, 3))
     assert none[0].shape == (0, 3) and not any(gradient.any() for gradient in none[1:])

@@ -12,7 +12,7 @@ from vfr_bake.config import FieldConfig
 from vfr_bake.field.field import VfrField
 from vfr_bake.field.networks import (
     DensityNetwork,
-    Head,
+    HeadNetwork,
     Pilot,
     SphericalHarmonics,
     TruncatedExp,
@@ -44,14 +44,16 @@ def test_compiled_density_equals_the_network(width: int) -> None:
 
 
 def test_head_has_the_papers_shape() -> None:
-    head = Head(FieldConfig())
+    head = HeadNetwork(FieldConfig())
     shapes = [tuple(layer.weight.shape) for layer in (*head.spatial, *head.directional, head.out)]
     assert shapes == [(256, 32), (320, 256), (256, 320), (256, 256), (256, 256), (256, 256), (3, 256)]
     assert sum(rows * columns for rows, columns in shapes) == 369_408
 
 
 def test_plain_encoding_predicts_no_features() -> None:
-    head = Head(FieldConfig(view_encoding="sh", activation="relu", n_directional_layers=2, head_width=64))
+    head = HeadNetwork(
+        FieldConfig(view_encoding="sh", activation="relu", n_directional_layers=2, head_width=64)
+    )
     shapes = [tuple(layer.weight.shape) for layer in (*head.spatial, *head.directional, head.out)]
     assert shapes == [(64, 32), (64, 64), (64, 80), (64, 64), (3, 64)]
     assert head.activation is torch.nn.functional.relu
@@ -59,11 +61,11 @@ def test_plain_encoding_predicts_no_features() -> None:
 
 def test_head_depends_on_the_direction_through_the_basis_alone() -> None:
     torch.manual_seed(0)
-    head = Head(FieldConfig(n_levels=2, head_width=32, sh_degree=1))
+    head = HeadNetwork(FieldConfig(n_levels=2, head_width=32, sh_degree=1))
     features = torch.randn(6, 4)
     dirs = torch.nn.functional.normalize(torch.randn(6, 3), dim=-1)
     torch.testing.assert_close(head(features, dirs), head(features, -dirs))  # degree 1: a constant basis
-    head = Head(FieldConfig(n_levels=2, head_width=32, sh_degree=2))
+    head = HeadNetwork(FieldConfig(n_levels=2, head_width=32, sh_degree=2))
     assert not torch.allclose(head(features, dirs), head(features, -dirs), atol=1e-4)
 
 

@@ -18,7 +18,7 @@ from vfr_bake.data.capture import PosedImages
 from vfr_bake.data.demo import demo_capture, demo_scene
 from vfr_bake.data.scene import Scene, build_scene
 from vfr_bake.data.store import stored
-from vfr_bake.data.store.stored import Layout, in_order, map_pictures, write_picture
+from vfr_bake.data.store.stored import StoreLayout, in_order, map_pictures, write_picture
 from vfr_bake.data.store.working import WorkingSize
 from vfr_bake.field.hash_grid import Backend
 from vfr_bake.training.checkpoint import load_checkpoint, save_checkpoint
@@ -159,7 +159,7 @@ def test_only_in_scenes_what_is_near_learns_slowly(
 def on_disk(scene: Scene, path: Path) -> Scene:
     """Return the scene with its training pictures on the disk, in ten chunks, each used for a few steps."""
     images = scene.train.images
-    layout = Layout.of((image.shape[1], image.shape[0]) for image in images)
+    layout = StoreLayout.of((image.shape[1], image.shape[0]) for image in images)
     assert len(layout.chunks) == 11
     with path.open("wb") as file:
         for number, image in enumerate(images):

@@ -25,7 +25,7 @@ from player.asset.pyramid import Bricks, corners_of, packed_bits
 from player.cameras.camera import Camera
 from player.compiled.samples import sample_rays
 from player.progress import Progress
-from vfr_bake.baking.grids import Layout, Vertices
+from vfr_bake.baking.grids import GridVertices, Layout
 from vfr_bake.kernels.sample_weights import BLOCKS, add_block_weights
 
 RAYS_AT_ONCE = 1 << 14
@@ -83,19 +83,21 @@ def live_of_blocks(blocks: np.ndarray) -> np.ndarray:
     return packed_bits(blocks)
 
 
-class Kept(NamedTuple):
+class KeptVertices(NamedTuple):
     """The kept vertices of a grid."""
 
-    vertices: Vertices
+    vertices: GridVertices
     rows: np.ndarray
     """[n] int32, ascending: the rows of these vertices among all vertices of the grid."""
 
 
-def corners_within(vertices: Vertices, cells: Bricks) -> Kept:
+def corners_within(vertices: GridVertices, cells: Bricks) -> KeptVertices:
     """Return the corners of `cells`, which are a part of the cells that have `vertices` as corners."""
     corners = corners_of(cells)
     rows = vertices.pyramid.vertices[0].rows_of(corners)
-    return Kept(Vertices(corners.coords, corners.masks, vertices.index[rows], vertices.resolution), rows)
+    return KeptVertices(
+        GridVertices(corners.coords, corners.masks, vertices.index[rows], vertices.resolution), rows
+    )
 
 
 def overlapping(cells: Bricks, resolution: int, others: Bricks, of_others: int) -> Bricks:

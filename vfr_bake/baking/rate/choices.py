@@ -33,7 +33,7 @@ TABLES = 1.04
 """Factor on the bytes of the symbols in a file that accounts for the probability tables stored with them."""
 
 
-class Chosen(NamedTuple):
+class ChosenValues(NamedTuple):
     """The values of a pyramid that are stored at some price."""
 
     stored: PyramidValues
@@ -69,7 +69,7 @@ class Choices:
         self._places = [places_between(*two) for two in pairwise(vertices)]
         self._rows = [_all_rows(level_rows(of_level)) for of_level in vertices]
 
-    def at(self, price: float) -> Chosen:
+    def at(self, price: float) -> ChosenValues:
         """Choose the values to store if saving a bit is worth a mean square error of `price`."""
         n_channels = self._wanted[0].shape[1]
         values = tuple(np.empty((len(wanted), n_channels), self._kind) for wanted in self._wanted)
@@ -80,7 +80,7 @@ class Choices:
         with ThreadPoolExecutor(get_num_threads()) as threads:
             found = list(threads.map(channel, range(n_channels)))
         distortion, bits = np.sum(found, axis=0).tolist()
-        return Chosen(PyramidValues(self._pyramid, values), distortion, TABLES * bits / 8)
+        return ChosenValues(PyramidValues(self._pyramid, values), distortion, TABLES * bits / 8)
 
     def _choose_channel(self, number: int, price: float, out: Sequence[np.ndarray]) -> tuple[float, float]:
         """Choose channel `number` of all levels into `out`. Returns the distortion of the finest level and

@@ -17,7 +17,7 @@ from player.cameras.colmap import colmap_folder
 from player.errors import ConfigError, DataError
 from player.progress import Progress
 from vfr_bake.data.capture import PosedImages
-from vfr_bake.data.check.looks import MIN_SHARED, Look, Shared, compare, look_at
+from vfr_bake.data.check.looks import MIN_SHARED, PictureMeasures, Shared, compare, look_at
 from vfr_bake.data.check.turning import share_turned
 from vfr_bake.data.check.verdict import GOOD_SHARED, judged
 from vfr_bake.data.files.archives import is_archive, unpack
@@ -44,7 +44,7 @@ class CheckedPicture:
     """Width and height in pixels, upright; None if the picture cannot be read."""
     used: tuple[int, int] | None
     """Width and height at the working size."""
-    look: Look | None
+    look: PictureMeasures | None
     """What was seen of the picture; None if there was no time to look at it, or if it cannot be read."""
     partners: int | None
     """Number of the pictures that share features with this one, of those that it was compared with; None if
@@ -141,7 +141,7 @@ def check_data(
     begin = time.monotonic()
     pictures = _listed(data)
     looks = look_at(pictures.paths, 0.8 * seconds, progress, most)
-    seen = [look if isinstance(look, Look) else None for look in looks]
+    seen = [look if isinstance(look, PictureMeasures) else None for look in looks]
     shared = compare(seen, 0.2 * seconds)
     blurry = _blurred(seen)
     partners = _partners(len(seen), shared)
@@ -219,7 +219,7 @@ def _size(path: Path) -> tuple[int, int] | None:
         return None
 
 
-def _blurred(looks: Sequence[Look | None]) -> set[int]:
+def _blurred(looks: Sequence[PictureMeasures | None]) -> set[int]:
     """Return the numbers of the pictures that training would leave out as blurred, of those that were looked
     at."""
     there = [i for i, look in enumerate(looks) if look is not None]
@@ -234,7 +234,7 @@ def _partners(n: int, shared: dict[tuple[int, int], Shared]) -> list[int | None]
     return [int(p) if c else None for p, c in zip(partners, compared, strict=True)]
 
 
-def _fault(look: Look | None, blurry: bool, partners: int | None) -> str | None:
+def _fault(look: PictureMeasures | None, blurry: bool, partners: int | None) -> str | None:
     if look is None:
         return None
     if blurry:

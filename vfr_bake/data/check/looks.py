@@ -41,7 +41,7 @@ GOLDEN = 0.6180339887498949
 
 
 @dataclass(frozen=True)
-class Look:
+class PictureMeasures:
     """The features and measurements of one picture."""
 
     size: tuple[int, int]
@@ -74,7 +74,7 @@ class Shared(NamedTuple):
     neighbours."""
 
 
-def look(path: Path) -> Look:
+def look(path: Path) -> PictureMeasures:
     """Look at one picture. Raises DataError, MissingExtraError."""
     cv2 = opencv(f"{path}: picture: expected OpenCV to look at it", "train")
     size = picture_size(path, upright=True)
@@ -89,7 +89,7 @@ def look(path: Path) -> Look:
     over_grey.alpha_composite(Image.fromarray(small))
     over_grey.thumbnail((THUMBNAIL_SIDE, THUMBNAIL_SIDE), Image.Resampling.BOX)
     over_grey.convert("RGB").save(thumbnail, "JPEG", quality=70)
-    return Look(
+    return PictureMeasures(
         size=size,
         sharpness=sharpness(cv2, small),
         blur=blur(small),
@@ -125,7 +125,7 @@ def _features(cv2: Any, rgba: np.ndarray, light: np.ndarray) -> tuple[np.ndarray
 
 def look_at(
     paths: Sequence[Path], seconds: float, progress: Progress | None = None, most: int | None = None
-) -> list[Look | str | None]:
+) -> list[PictureMeasures | str | None]:
     """Look at pictures for about `seconds`, and at no more than `most`.
 
     Pairs of neighbours are taken in an order that spreads them over all pictures, so that those seen in the
@@ -136,7 +136,7 @@ def look_at(
     pairs = sorted(range((len(paths) + 1) // 2), key=lambda pair: pair * GOLDEN % 1)
     order = [i for pair in pairs for i in (2 * pair, 2 * pair + 1) if i < len(paths)][:most]
 
-    def looked(number: int) -> tuple[int, Look | str | None]:
+    def looked(number: int) -> tuple[int, PictureMeasures | str | None]:
         if time.monotonic() > end:
             return number, None
         try:
@@ -144,7 +144,7 @@ def look_at(
         except DataError as error:
             return number, str(error)
 
-    seen: list[Look | str | None] = [None] * len(paths)
+    seen: list[PictureMeasures | str | None] = [None] * len(paths)
     for done, (number, found) in enumerate(one_by_one(looked, order, n_threads())):
         seen[number] = found
         if progress is not None:
@@ -152,7 +152,7 @@ def look_at(
     return seen
 
 
-def compare(looks: Sequence[Look | None], seconds: float) -> dict[tuple[int, int], Shared]:
+def compare(looks: Sequence[PictureMeasures | None], seconds: float) -> dict[tuple[int, int], Shared]:
     """Return what pairs (i, j), i < j, of pictures share. All neighbours in the order of the pictures are
     compared, and then, until about `seconds` are over, each picture of a sample with each other. Pairs that
     were not compared are missing."""

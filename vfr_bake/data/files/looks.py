@@ -16,7 +16,7 @@ from vfr_bake.data.features import MAX_SIDE, Features, find_features
 from vfr_bake.data.files.masks import apply_mask
 from vfr_bake.data.files.opening import exif_of, open_photograph
 from vfr_bake.data.files.pictures import enough_for, opencv, picture_size, read_picture, sharpness
-from vfr_bake.data.kept_matches import SIDE, Found, KeptMatches, stamp
+from vfr_bake.data.kept_matches import SIDE, KeptFeatures, KeptMatches, stamp
 from vfr_bake.data.mapping import Sensor
 
 
@@ -50,7 +50,7 @@ def look_at(
     return threads.in_threads(look, pictures, progress)
 
 
-def _found_in(path: Path, mask: Path | None) -> Found:
+def _found_in(path: Path, mask: Path | None) -> KeptFeatures:
     width, height = picture_size(path, upright=True)
     # A picture with a mask is decoded at its full size, because its mask has that size.
     rgba = read_picture(path, True, None if mask is not None else enough_for((width, height), MAX_SIDE))
@@ -62,7 +62,7 @@ def _found_in(path: Path, mask: Path | None) -> Found:
     # A JPEG decoder reduces by a whole factor, and rounds up at the edge.
     points = found.points * max(1, round(width / rgba.shape[1]))
     found = replace(found, points=points.clip(0, (width, height)))
-    return Found(width, height, found, np.asarray(grey).reshape(-1), sharpness(cv2, rgba))
+    return KeptFeatures(width, height, found, np.asarray(grey).reshape(-1), sharpness(cv2, rgba))
 
 
 def sensor_of(path: Path, width: int, height: int) -> Sensor:

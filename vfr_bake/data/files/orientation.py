@@ -27,7 +27,7 @@ INVERSE = {6: 8, 8: 6}
 """The two orientations that are each other's inverse. Every other orientation is its own inverse."""
 
 
-class Layout(NamedTuple):
+class PictureHeader(NamedTuple):
     """The size and the orientation of a picture file."""
 
     width: int
@@ -55,7 +55,7 @@ class Layout(NamedTuple):
         return (self.height, self.width) if self.number >= 5 else (self.width, self.height)
 
 
-def layout_of(picture: Image.Image) -> Layout:
+def layout_of(picture: Image.Image) -> PictureHeader:
     """Return the layout of an opened picture, without decoding its pixels."""
     turned = picture.format in ("HEIF", "TIFF")
     if picture.format == "HEIF":
@@ -69,16 +69,16 @@ def layout_of(picture: Image.Image) -> Layout:
     width, height = picture.size
     if turned and number >= 5:
         width, height = height, width
-    return Layout(width, height, number, turned, picture.format == "HEIF")
+    return PictureHeader(width, height, number, turned, picture.format == "HEIF")
 
 
-def read_layout(path: Path) -> Layout:
+def read_layout(path: Path) -> PictureHeader:
     """Return the layout of a picture file, without decoding it. Raises FormatError."""
     with open_photograph(path) as picture:
         return layout_of(picture)
 
 
-def is_taken_upright(layout: Layout, size: tuple[float, float] | None) -> bool:
+def is_taken_upright(layout: PictureHeader, size: tuple[float, float] | None) -> bool:
     """Return whether a camera that comes with a data set belongs to the picture upright, and not to the
     pixels as stored.
 

@@ -26,7 +26,7 @@ from player.files.files import new_folder
 from player.files.json_files import parse_json, read_json
 from player.kept_code import user_folder
 from vfr_bake.data.files.pictures import DescribedView
-from vfr_bake.data.store.stored import Layout, MappedImages, map_pictures
+from vfr_bake.data.store.stored import MappedImages, StoreLayout, map_pictures
 from vfr_bake.data.store.working import WorkingSize
 
 VERSION = 1
@@ -39,7 +39,7 @@ RESERVE = 500_000_000
 INDEX, PIXELS, MODELS = "index.json", "pixels.bin", "models.txt"
 
 
-class Kept(NamedTuple):
+class CachedPictures(NamedTuple):
     """A set of pictures at the working size."""
 
     cameras: list[Camera]
@@ -70,14 +70,14 @@ def _described(part: object) -> object:
     return part
 
 
-def opened(folder: Path, described: Sequence[DescribedView]) -> Kept | None:
+def opened(folder: Path, described: Sequence[DescribedView]) -> CachedPictures | None:
     """Open the set in `folder`, with the poses of the pictures as they are `described`; None if there is no
     set, or none that is whole."""
     try:
         index = parse_json(read_json(folder / INDEX, "an index of pictures"), str(folder))
         if index["version"] != VERSION or len(index["intrinsics"]) != len(described):
             return None
-        layout = Layout.of(index["sizes"])
+        layout = StoreLayout.of(index["sizes"])
         if (folder / PIXELS).stat().st_size != int(layout.chunks[-1]) * index["n_channels"]:
             return None
         images = map_pictures(folder / PIXELS, layout, index["n_channels"], frozenset(index["transparent"]))
@@ -87,10 +87,12 @@ def opened(folder: Path, described: Sequence[DescribedView]) -> Kept | None:
         ]
     except (FormatError, OSError, ValueError, LookupError, ArithmeticError, TypeError):
         return None
-    return Kept(cameras, images)
+    return CachedPictures(cameras, images)
 
 
-def index_bytes(layout: Layout, cameras: Sequence[Camera], n_channels: int, transparent: set[int]) -> bytes:
+def index_bytes(
+    layout: StoreLayout, cameras: Sequence[Camera], n_channels: int, transparent: set[int]
+) -> bytes:
     """Return the content of a set's `index.json`."""
     document: dict[str, Any] = {
         "version": VERSION,

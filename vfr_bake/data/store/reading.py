@@ -23,7 +23,7 @@ from player.progress import Progress
 from vfr_bake.data.capture import PosedImages
 from vfr_bake.data.files.pictures import DescribedView, viewed_size
 from vfr_bake.data.store import cache
-from vfr_bake.data.store.stored import Layout, in_order, write_picture
+from vfr_bake.data.store.stored import StoreLayout, in_order, write_picture
 from vfr_bake.data.store.working import WorkingSize
 from vfr_bake.data.threads import in_threads, n_threads, one_by_one
 
@@ -175,8 +175,8 @@ class PictureReader:
         folder: Path,
         n_channels: int,
         progress: Progress | None,
-    ) -> cache.Kept:
-        layout = Layout.of(self.size.size(*size) for size in sizes)
+    ) -> cache.CachedPictures:
+        layout = StoreLayout.of(self.size.size(*size) for size in sizes)
         n_bytes = int(layout.chunks[-1]) * n_channels
         try:
             if self._kept:
@@ -210,7 +210,7 @@ class PictureReader:
     def _fill(
         self,
         folder: Path,
-        layout: Layout,
+        layout: StoreLayout,
         described: Sequence[DescribedView],
         sizes: Sequence[tuple[int, int]],
         n_channels: int,
@@ -256,7 +256,7 @@ def _n_channels(described: Sequence[DescribedView]) -> int:
     return 3 if opaque else 4
 
 
-def _whole(folder: Path, described: Sequence[DescribedView]) -> cache.Kept:
+def _whole(folder: Path, described: Sequence[DescribedView]) -> cache.CachedPictures:
     found = cache.opened(folder, described)
     if found is None:
         raise OutputError(f"{folder}: pictures: what was written cannot be read again")

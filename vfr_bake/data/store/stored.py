@@ -32,7 +32,7 @@ STRIDES_TRIED = 100
 _PLACES_AT_ONCE = 1 << 20
 
 
-class Layout(NamedTuple):
+class StoreLayout(NamedTuple):
     """The positions of the pictures' pixels in the file, counted in pixels."""
 
     sizes: np.ndarray
@@ -45,7 +45,7 @@ class Layout(NamedTuple):
     """[n_chunks + 1] int64: the position in the file at which each chunk begins, and the end of the last."""
 
     @classmethod
-    def of(cls, sizes: Iterable[tuple[int, int]]) -> Layout:
+    def of(cls, sizes: Iterable[tuple[int, int]]) -> StoreLayout:
         """Return the layout of pictures of `sizes` (width, height), at least one.
 
         >>> Layout.of([(160, 120), (160, 120), (2, 1)]).chunks.tolist()
@@ -95,7 +95,7 @@ def in_order(image: np.ndarray, n_channels: int) -> np.ndarray:
     return np.ascontiguousarray(pixels[:, :n_channels])
 
 
-def write_picture(file: BinaryIO, layout: Layout, number: int, pixels: np.ndarray) -> None:
+def write_picture(file: BinaryIO, layout: StoreLayout, number: int, pixels: np.ndarray) -> None:
     """Write a picture's pixels, ordered by `in_order`, to their positions in the file. Raises OSError."""
     n_channels, edges = pixels.shape[1], layout.edges[number]
     for chunk, begin in enumerate(layout.begins[number].tolist()):
@@ -119,7 +119,7 @@ class MappedImages(StoredImages):
     def __init__(
         self,
         file: np.ndarray,
-        layout: Layout,
+        layout: StoreLayout,
         transparent: frozenset[int],
         numbers: Sequence[int] | None = None,
     ) -> None:
@@ -200,7 +200,9 @@ class MappedImages(StoredImages):
             mapped.madvise(mmap.MADV_WILLNEED, begin, end - begin)
 
 
-def map_pictures(path: Path, layout: Layout, n_channels: int, transparent: frozenset[int]) -> MappedImages:
+def map_pictures(
+    path: Path, layout: StoreLayout, n_channels: int, transparent: frozenset[int]
+) -> MappedImages:
     """Map the pictures of a file into memory; none of them is read yet. Raises OSError, ValueError (the file
     is too short)."""
     file = np.memmap(path, np.uint8, "r", shape=(int(layout.chunks[-1]), n_channels))

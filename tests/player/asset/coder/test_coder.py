@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from player import compiling
 from player.asset.coder import arrays, coder
 from player.asset.coder.coder import MAX_LANES, Decoder, decode, encode
-from player.asset.coder.lanes import Lanes, Neighbours
+from player.asset.coder.lanes import Neighbours, RowsToLanes
 from player.asset.coder.tables import (
     CONTEXT_OF_SUM,
     END,
@@ -208,7 +208,7 @@ def test_tables_cost_what_they_say() -> None:
 
 def test_lanes_are_runs_of_rows() -> None:
     for n, n_lanes in ((1, 1), (7, 3), (9, 3), (10, 10), (11, 10), (4096, 1)):
-        lanes = Lanes(n, n_lanes)
+        lanes = RowsToLanes(n, n_lanes)
         order = lanes.in_order(np.arange(n))
         assert np.array_equal(lanes.by_row(order), np.arange(n))
         assert np.array_equal(lanes.step()[order], np.arange(n) // n_lanes)

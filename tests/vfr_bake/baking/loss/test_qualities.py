@@ -15,7 +15,14 @@ from player.render import Renderer
 from vfr_bake.baking import qualities
 from vfr_bake.baking.bake import bake
 from vfr_bake.baking.limits import LOOKUPS
-from vfr_bake.baking.qualities import ALLOWED_DB, SHARES, WORST, View, compared_views, fitting_qualities
+from vfr_bake.baking.qualities import (
+    ALLOWED_DB,
+    SHARES,
+    WORST,
+    ComparedView,
+    compared_views,
+    fitting_qualities,
+)
 from vfr_bake.config import BakeConfig
 from vfr_bake.training.model_file import Model
 
@@ -48,11 +55,11 @@ def pictures(asset: Asset, cameras: list[Camera], quality: Quality) -> list[np.n
         ]
 
 
-def views_with(asset: Asset, cameras: list[Camera], noise: float) -> list[View]:
+def views_with(asset: Asset, cameras: list[Camera], noise: float) -> list[ComparedView]:
     """Return views whose photographs are the asset's exact pictures with noise."""
     random, pixels = np.random.default_rng(0), np.arange(96 * 80)
     return [
-        View(camera, pixels, exact + random.normal(0, noise, exact.shape))
+        ComparedView(camera, pixels, exact + random.normal(0, noise, exact.shape))
         for camera, exact in zip(cameras, pictures(asset, cameras, "exact"), strict=True)
     ]
 
@@ -63,7 +70,7 @@ def fewest(asset: Asset) -> int:
     return min(n for n in (*LOOKUPS, own) if 2 * n >= own)
 
 
-def lost(asset: Asset, views: list[View], quality: Quality) -> np.ndarray:
+def lost(asset: Asset, views: list[ComparedView], quality: Quality) -> np.ndarray:
     """Return what pictures of a quality lose, [n_views] in dB, by a loop."""
     cameras = [view.camera for view in views]
     found = []
@@ -106,7 +113,7 @@ def test_pictures_with_the_levels_that_are_found_lose_what_is_allowed(
 
 @pytest.mark.usefixtures("any_share")
 def test_the_better_an_asset_the_nearer_pixels_must_agree(asset: Asset, cameras: list[Camera]) -> None:
-    views = [View(camera, np.arange(96 * 80), None) for camera in cameras]
+    views = [ComparedView(camera, np.arange(96 * 80), None) for camera in cameras]
     every = [fitting_qualities(asset, views, error) for error in (1.0, 1e-3, 3e-4, 1e-9)]
     found = [qualities.agreement for qualities in every]
     assert found[0] == AGREEMENT[False] and found[-1] == (0.0, 0.0)
@@ -119,7 +126,7 @@ def test_the_better_an_asset_the_nearer_pixels_must_agree(asset: Asset, cameras:
 def test_where_most_would_be_marched_rays_fetch_less_instead(
     asset: Asset, cameras: list[Camera], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    views = [View(camera, np.arange(96 * 80), None) for camera in cameras]
+    views = [ComparedView(camera, np.arange(96 * 80), None) for camera in cameras]
     assert min(fitting_qualities(asset, views, 1.0).agreement) > 0
     monkeypatch.setattr(qualities, "MARCH", 1e9)
     monkeypatch.setattr(qualities, "FEWER", 0.0)
@@ -129,7 +136,7 @@ def test_where_most_would_be_marched_rays_fetch_less_instead(
 
 @pytest.mark.usefixtures("any_share")
 def test_one_view_is_trusted_less(asset: Asset, cameras: list[Camera]) -> None:
-    view = View(cameras[0], np.arange(96 * 80), None)
+    view = ComparedView(cameras[0], np.arange(96 * 80), None)
     alone, twice = (fitting_qualities(asset, [view] * n, 1e-3) for n in (1, 2))
     assert all(a <= b for a, b in zip(alone.agreement, twice.agreement, strict=True))
 

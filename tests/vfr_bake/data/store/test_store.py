@@ -20,7 +20,7 @@ from vfr_bake.data.capture import StoredImages
 from vfr_bake.data.demo import demo_cameras
 from vfr_bake.data.store import cache, reading, stored
 from vfr_bake.data.store.reading import PictureReader
-from vfr_bake.data.store.stored import Layout, in_order, map_pictures, write_picture
+from vfr_bake.data.store.stored import StoreLayout, in_order, map_pictures, write_picture
 from vfr_bake.data.store.working import WorkingSize
 from vfr_bake.data.witnesses import choose_witnesses
 from vfr_bake.training.rays import DevicePixelSampler, PixelSampler
@@ -43,7 +43,7 @@ def pictures(n_channels: int) -> list[np.ndarray]:
 
 
 def written(folder: Path, images: list[np.ndarray], n_channels: int) -> stored.MappedImages:
-    layout = Layout.of((image.shape[1], image.shape[0]) for image in images)
+    layout = StoreLayout.of((image.shape[1], image.shape[0]) for image in images)
     path = folder / "pixels.bin"
     cache.reserve(path, int(layout.chunks[-1]) * n_channels)
     with path.open("r+b") as file:
