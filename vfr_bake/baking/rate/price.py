@@ -31,9 +31,9 @@ SLOPE, SLOPES = 0.7, (0.25, 2.0)
 that follows from two prices, limited to the range SLOPES."""
 FURTHEST = 16.0
 """Largest factor from one tried price to the next."""
-AIM, CLOSE = 0.9, 0.8
+AIM, CLOSE = 0.95, 0.9
 """Share of the allowed loss that the next price aims at; and share from which a price is near enough."""
-NEAR = 1.4
+NEAR = 1.15
 """The search also ends at two prices with at most this factor between them, if the higher one loses too
 much."""
 MOST_PRICES = 12
