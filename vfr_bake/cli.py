@@ -475,6 +475,12 @@ def _bench(options: Any) -> int:
     lpips = None if options.lpips is None else Lpips(options.lpips)
     with Bars() as bars:
         trade = measure_trade(options, lpips, bars.count)
+    if (timed := trade.conditions["frames_a_setting_and_size"]) < options.frames:
+        print(
+            f"vfr-bench: timed {timed} of {options.frames} frames of each setting and size in "
+            f"{options.minutes:g} minutes: for more, raise --minutes or give --samples and --sizes",
+            file=sys.stderr,
+        )
     if options.html is not None:
         write_bytes(options.html, trade_page(trade))
     write_result(options.json, trade.document(), "\n".join([*table_lines(trade), trade.recommendation]))

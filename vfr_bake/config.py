@@ -423,6 +423,9 @@ class BenchConfig:
     """Numbers of lookups a ray, 0 for every sample; the assets' own is always among them."""
     frames: int = 20
     """Timed frames of each setting and size."""
+    minutes: float = 10
+    """Minutes of the whole measurement, roughly: on a slow machine fewer frames are timed, at least two of
+    each setting and size."""
     threads: int | None = None
     """Threads of the player; one for each core if not given."""
     max_memory: float | None = None
@@ -440,6 +443,7 @@ class BenchConfig:
         if not all(0 <= k <= 1024 for k in self.samples):
             raise ConfigError(f"samples: expected 0 to 1024, got {[*self.samples]}")
         check(self, "frames", self.frames >= 2, "at least 2")
+        check(self, "minutes", self.minutes > 0, "more than 0")
         check(self, "threads", self.threads is None or self.threads >= 1, "at least 1")
         self.frame_sizes()
 

@@ -185,8 +185,9 @@ def _stored_corners(_: Any, stored: Any, places: Any, weights: Any, rows: Any, s
 
 
 stored_corners: Any = intrinsic(_stored_corners)
-"""stored_corners(stored: Stored, places [3, LANES] float32, weights [LANES] float32, rows [8, LANES] int32,
-shares [9, LANES] float32): find the stored corners around LANES places; returns the greatest of their rows.
+"""stored_corners(stored: StoredFeatures, places [3, LANES] float32, weights [LANES] float32, rows [8, LANES]
+int32, shares [9, LANES] float32): find the stored corners around LANES places; returns the greatest of their
+rows.
 
 `places` are in cells of the densities' grid. `rows` gets the row of each corner. `shares` gets the corner's
 interpolation weight, divided by the sum of those of all stored corners and multiplied by the place's number

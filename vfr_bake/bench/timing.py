@@ -12,6 +12,7 @@ so that a single pause has no effect.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -37,6 +38,8 @@ class Dials(NamedTuple):
 
 
 Ask = Callable[..., dict[str, Any]]
+FEWEST_ROUNDS = 2
+"""Rounds that are made however long they take: with fewer there is no spread."""
 SEED = 0
 """Seed of the random orders within the rounds."""
 
@@ -69,15 +72,20 @@ def measure_times(
     sizes: Sequence[Size],
     dials: Sequence[Dials],
     n_rounds: int,
+    until: float,
     progress: Callable[[int, int], object],
 ) -> dict[tuple[int, Dials, Size], Times]:
     """Return the times of every (player, dials, size); each of `players` is a function that asks
-    one process for a frame."""
+    one process for a frame.
+
+    There are `n_rounds` rounds, or as many as are expected to end before `until`, which is compared with
+    `time.monotonic()`; but at least FEWEST_ROUNDS.
+    """
     random = np.random.default_rng(SEED)
     visits: dict[tuple[int, Size], list[dict[Dials, dict[str, Any]]]] = {}
-    done, total = 0, n_rounds * len(players) * len(sizes)
-    for turn in range(n_rounds):
-        places = [(player, size) for player in range(len(players)) for size in sizes]
+    places = [(player, size) for player in range(len(players)) for size in sizes]
+    begin, turn, done = time.monotonic(), 0, 0
+    while turn < n_rounds:
         for index in random.permutation(len(places)):
             player, size = places[index]
             ask = players[player]
@@ -87,12 +95,15 @@ def measure_times(
             answers = {dials[i]: ask(**request, **dials[i].request()) for i in order}
             visits.setdefault((player, size), []).append(answers)
             done += 1
-            progress(done, total)
+            progress(done, n_rounds * len(places))
+        turn += 1
+        a_round = (time.monotonic() - begin) / turn
+        n_rounds = int(min(n_rounds, max((until - begin) / a_round, FEWEST_ROUNDS)))
     times = {}
     for (player, size), rounds in visits.items():
         slope = lookup_slope(rounds)
-        shared = [_mean_ms([visits[other, size][turn] for other in range(len(players))])
-                  for turn in range(n_rounds)]  # fmt: skip
+        shared = [_mean_ms([visits[other, size][number] for other in range(len(players))])
+                  for number in range(turn)]  # fmt: skip
         for some in dials:
             times[player, some, size] = frame_times([answers[some] for answers in rounds], slope, shared)
     return times

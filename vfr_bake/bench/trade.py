@@ -76,6 +76,7 @@ def measure_trade(config: BenchConfig, lpips: Distance | None, progress: Report)
     Raises ConfigError, DataError or FormatError: an asset, the model or the data cannot be used, or they are
     not of one scene.
     """
+    begin = time.monotonic()
     assets = {  # opened whole, because figures of a part would be reported as those of the asset
         str(folder): Asset.open(folder, verify=True, max_memory=config.max_memory) for folder in config.assets
     }
@@ -99,6 +100,7 @@ def measure_trade(config: BenchConfig, lpips: Distance | None, progress: Report)
             sizes,
             dials,
             config.frames,
+            begin + 60 * config.minutes,
             lambda done, of: progress("frame times", done, of),
         )
         played = players[0].ask(view=0, size=own, **dials[0].request(), rgb=None)
@@ -124,7 +126,7 @@ def measure_trade(config: BenchConfig, lpips: Distance | None, progress: Report)
         "data": config.data,
         "model": None if config.model is None else str(config.model),
         "views": [camera.name for camera in views.cameras],
-        "frames_a_setting_and_size": config.frames,
+        "frames_a_setting_and_size": next(iter(times.values())).frames,
         "threads": played["threads"],
         "march": played["march"],
         "front_at": list(own),

@@ -13,17 +13,28 @@ from player.threads import default_threads
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
+MOST_BYTES = 1_000_000_000
+"""Most memory of all threads together."""
 
-def n_threads() -> int:
-    """Return the number of threads: as many as the cores that this process may use, but at most eight,
-    because each holds a decoded picture or a block of a matrix product."""
-    return min(8, default_threads())
+
+def n_threads(bytes_each: int = 1) -> int:
+    """Return the number of threads: as many as the cores that this process may use, but at most eight, and
+    so few that they take at most MOST_BYTES if each takes `bytes_each`. There is at least one.
+
+    >>> n_threads(10**12)
+    1
+    """
+    return max(1, min(8, default_threads(), MOST_BYTES // bytes_each))
 
 
 def in_threads(
-    function: Callable[[Item], Result], items: Sequence[Item], progress: Progress | None
+    function: Callable[[Item], Result],
+    items: Sequence[Item],
+    progress: Progress | None,
+    bytes_each: int = 1,
 ) -> list[Result]:
-    """Call `function` for every item, and return the results in the order of the items.
+    """Call `function` for every item, and return the results in the order of the items. `bytes_each`: memory
+    that a call takes.
 
     An exception in one call, or an interruption, cancels the calls that have not begun.
 
@@ -31,7 +42,7 @@ def in_threads(
     ['1', '2']
     """
     results = []
-    for result in one_by_one(function, items, n_threads()):
+    for result in one_by_one(function, items, n_threads(bytes_each)):
         results.append(result)
         if progress is not None:
             progress(len(results), len(items))

@@ -130,7 +130,7 @@ class SphericalHarmonics(nn.Module):
 class HeadNetwork(nn.Module):
     """The head: rgb = head(sum w_i F_i, d).
 
-    >>> head = Head(FieldConfig(n_levels=2, head_width=8))
+    >>> head = HeadNetwork(FieldConfig(n_levels=2, head_width=8))
     >>> head(torch.zeros(3, 4), torch.tensor([[0.0, 0.0, 1.0]]).expand(3, 3)).shape
     torch.Size([3, 3])
     """

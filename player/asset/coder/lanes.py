@@ -37,7 +37,7 @@ class RowsToLanes:
     def in_order(self, by_row: np.ndarray) -> np.ndarray:
         """Return the elements of `by_row` [n] in the order of coding.
 
-        >>> Lanes(7, 3).in_order(np.arange(7)).tolist()
+        >>> RowsToLanes(7, 3).in_order(np.arange(7)).tolist()
         [0, 3, 5, 1, 4, 6, 2]
         """
         longer, shorter = self.runs(by_row)
@@ -69,7 +69,7 @@ class Neighbours:
     """The three neighbours of each row, whose symbols tell most about the row's symbol.
 
     >>> rows = Neighbours(np.array([[-1, 0, 1, 2], [-1, -1, 0, 1], [-1, -1, -1, -1]], np.int32))
-    >>> rows.in_order(Lanes(4, 2))[0].tolist()
+    >>> rows.in_order(RowsToLanes(4, 2))[0].tolist()
     [4, 1, 0, 2]
     """
 

@@ -34,7 +34,7 @@ def trade(work: Work, scene: Scene, bakes: tuple[str, ...], samples: tuple[str, 
     work.command(
         "vfr-bench", *assets, "--data", data_of(work, scene), "--model", model, "--json", report,
         "--views", str(scene.views), "--frames", str(scene.frames), "--sizes", scene.size,
-        "--samples", *samples,
+        "--samples", *samples, "--minutes", "120",
     )  # fmt: skip
     found = work.read("trade.json")
     names = {str(work.file(name, "asset")): name for name in bakes}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 import shutil
 from dataclasses import asdict, replace
@@ -264,13 +265,33 @@ def test_rounds_ask_everybody_in_turn() -> None:
         return ask
 
     times = measure_times(
-        [player("a"), player("b")], 2, [(8, 8)], [Dials(1), Dials(2)], 3, lambda done, of: None
+        [player("a"), player("b")], 2, [(8, 8)], [Dials(1), Dials(2)], 3, math.inf, lambda done, of: None
     )
     assert len(asked) == 3 * 2 * (1 + 2), "one frame of each visit is not counted"
     for visits in (asked[i : i + 6] for i in (0, 6, 12)):
         assert sorted({name for name, _ in visits}) == ["a", "b"]
     assert times[0, Dials(2), (8, 8)] == Times(20.0, 20.0, (20.0, 20.0), 0.0, 3, 4.0, 0.0, 3.0, 13.0)
     assert times[1, Dials(1), (8, 8)].uncertainty == 0
+
+
+@pytest.mark.parametrize(("until", "n_rounds"), [(-1.0, 2), (25.0, 2), (65.0, 6), (1e9, 8)])
+def test_there_are_as_many_rounds_as_there_is_time_for(
+    until: float, n_rounds: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A round of two sizes and two settings has six frames, of 1.75 s each here: 10.5 s."""
+    now, told = [0.0], []
+    monkeypatch.setattr("vfr_bake.bench.timing.time.monotonic", lambda: now[0])
+
+    def ask(**_: object) -> dict:
+        now[0] += 1.75
+        return {"ms": 1.0, "march_ms": 1.0, "head_ms": 0.0, "fetches": 1}
+
+    def progress(done: int, of: int) -> None:
+        told.append((done, of))
+
+    times = measure_times([ask], 1, [(8, 8), (4, 4)], [Dials(1), Dials(2)], 8, until, progress)
+    assert {each.frames for each in times.values()} == {n_rounds}
+    assert told[0] == (1, 16) and told[-1] == (2 * n_rounds, 2 * n_rounds)
 
 
 # --- where the loss sits ---

@@ -49,7 +49,7 @@ class PictureHeader(NamedTuple):
     def upright_size(self) -> tuple[int, int]:
         """Width and height once the picture is turned upright.
 
-        >>> Layout(40, 30, 6, False, False).upright_size
+        >>> PictureHeader(40, 30, 6, False, False).upright_size
         (30, 40)
         """
         return (self.height, self.width) if self.number >= 5 else (self.width, self.height)
@@ -87,9 +87,9 @@ def is_taken_upright(layout: PictureHeader, size: tuple[float, float] | None) ->
     cases the pixels are taken as stored, except those of HEIC, which are upright, because no program reads
     them otherwise.
 
-    >>> is_taken_upright(Layout(40, 30, 6, False, False), (30, 40))
+    >>> is_taken_upright(PictureHeader(40, 30, 6, False, False), (30, 40))
     True
-    >>> is_taken_upright(Layout(40, 30, 6, False, False), None)
+    >>> is_taken_upright(PictureHeader(40, 30, 6, False, False), None)
     False
     """
     if size is None or layout.number < 5 or min(size) <= 0:

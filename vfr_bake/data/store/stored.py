@@ -48,7 +48,7 @@ class StoreLayout(NamedTuple):
     def of(cls, sizes: Iterable[tuple[int, int]]) -> StoreLayout:
         """Return the layout of pictures of `sizes` (width, height), at least one.
 
-        >>> Layout.of([(160, 120), (160, 120), (2, 1)]).chunks.tolist()
+        >>> StoreLayout.of([(160, 120), (160, 120), (2, 1)]).chunks.tolist()
         [0, 19201, 38402]
         """
         table = np.array(list(sizes), np.int64)
