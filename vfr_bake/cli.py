@@ -185,21 +185,31 @@ def _say(data: str, text: str) -> None:
 
 def _with_cameras(data: str) -> str:
     """Return the folder to load. Unpack a ZIP first, and estimate the cameras of photographs or a video that
-    have none."""
+    have none. What stays as it is keeps its name: `./demo` is a folder, and `demo` the built-in scene."""
     from vfr_bake.data import needs_cameras, unpacked
-    from vfr_bake.data.poses import estimate_cameras
+    from vfr_bake.data.poses import added_since, estimate_cameras
 
-    if data != "demo":
-        with Bars() as bars:
-            data = str(unpacked(data, lambda done, of: bars.count("unpacking", done, of)))
+    if data == "demo":
+        return data
+    with Bars() as bars:
+        folder = unpacked(data, lambda done, of: bars.count("unpacking", done, of))
+    if folder != Path(data):
+        data = str(folder)
     if not needs_cameras(data):
+        if added := added_since(folder):
+            _say(
+                data,
+                f"{len(added)} pictures were added after the cameras were estimated, and are not used "
+                f"({printable(', '.join(added[:3]))}{', ...' if len(added) > 3 else ''}): remove "
+                f"{folder / 'sparse'} to use them",
+            )
         return data
     with Bars() as bars:
         report = estimate_cameras(Path(data), bars.count, partial(_say, data))
     print(f"vfr-train: {printable(report.summary())}", file=sys.stderr)
     for name, reason in report.unplaced.items():
         print(f"vfr-train:   no place for {printable(name)}: {printable(reason)}", file=sys.stderr)
-    return str(report.folder)
+    return data if report.folder == folder else str(report.folder)
 
 
 def _without_blurred(scene: Scene, processes: Processes) -> tuple[Scene, list[str]]:
@@ -290,7 +300,7 @@ def _train_steps(trainer: Trainer, checkpoint: Path, preview: Preview | None) ->
         "seconds": round(trainer.seconds, 1),
         "ended_early": trainer.duration.ended_early,
         "skipped_steps": trainer.n_bad_steps,
-        "training_psnr": round(decibels(error), 3),
+        "training_psnr": round(decibels(error), 3) if error else None,
         "interrupted": interrupted,
     }
 
@@ -310,7 +320,7 @@ def _expect(trainer: Trainer, seconds_a_step: float, bar: Bar) -> None:
 
 def _report_training(options: Any, figures: dict[str, Any], interrupted: bool) -> None:
     tested = ""
-    if "test_psnr" in figures:
+    if figures.get("test_psnr") is not None:
         tested = f", {figures['test_psnr']:.2f} dB on {figures['test_views']} test views"
     skipped = f", {figures['skipped_steps']} skipped (not finite)" if figures["skipped_steps"] else ""
     flat = ", which is all that pays" if figures["ended_early"] else ""
@@ -333,11 +343,12 @@ def _test_figures(model: Model, scene: Scene, n_views: int) -> dict[str, Any]:
         for score in evaluate(model, scene.test, n_views, masked=scene.masked):
             scores.append(score.psnr)
             bar.count(len(scores), n_views)
-    return {
+    figures = {
         "test_psnr": float(np.mean(scores)),
         "test_views": len(scores),
         "background": model.background.tolist(),
     }
+    return _finite(figures)
 
 
 def _bake(options: Any) -> int:
@@ -417,7 +428,7 @@ def _eval(options: Any) -> int:
 
     from player.cameras.transforms import frame_names
     from player.files.images import write_png
-    from vfr_bake.data import load_scene, reader_as
+    from vfr_bake.data import kind_as, load_scene, reader_as
     from vfr_bake.training.model_file import load_model
     from vfr_bake.training.scores.evaluation import render_views
     from vfr_bake.training.scores.lpips import Lpips
@@ -427,7 +438,11 @@ def _eval(options: Any) -> int:
     model = load_model(options.model, options.max_memory)
     with Bar("reading pictures") as bar:
         scene = load_scene(
-            options.data, bar.count, reader=reader_as(model.train), scale=model.train.get("scale")
+            options.data,
+            bar.count,
+            kind=kind_as(model.train),
+            scale=model.train.get("scale"),
+            reader=reader_as(model.train),
         )
     if not scene.test.cameras:
         raise DataError(f"{options.data}: test views: expected at least 1, got none")

@@ -13,6 +13,7 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -21,14 +22,17 @@ from PIL import Image
 
 from player.asset.asset import Asset
 from player.errors import DataError
-from vfr_bake.cli import EVAL_VIEWS, bake_main, eval_main, train_main
+from vfr_bake.cli import EVAL_VIEWS, _test_figures, _with_cameras, bake_main, eval_main, train_main
 from vfr_bake.config import EFFORT_MINUTES, TrainConfig
 from vfr_bake.data import load_scene
+from vfr_bake.data.poses import PoseReport
 from vfr_bake.data.scene import PosedImages
 from vfr_bake.rendering.render import render_image
+from vfr_bake.training.checkpoint import checkpoint_path, save_checkpoint
 from vfr_bake.training.model_file import Model, load_model, save_model
 from vfr_bake.training.scores.evaluation import RenderedView
 from vfr_bake.training.scores.metrics import over_background, psnr, to_8_bit
+from vfr_bake.training.trainer import Trainer
 
 SMALL = [
     *("--n-levels", "6", "--max-resolution", "48", "--log2-table-size", "13"),
@@ -348,6 +352,36 @@ def test_training_goes_on_after_kill_9(small_data: Path, tmp_path: Path) -> None
         assert torch.equal(tensor, fields[1][name]), name
 
 
+def test_a_training_that_was_complete_already_gives_a_model_that_bakes(
+    small_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With `--resume` and fewer steps than the checkpoint has, no step is taken and no error is measured."""
+    path, asset, kept = tmp_path / "model.pt", tmp_path / "asset", tmp_path / "kept"
+    settings = [*SMALL, "--steps", "30", "--eval-views", "0", "--checkpoint-minutes", "1e-6"]
+
+    def keep(target: Path, trainer: Trainer) -> None:
+        save_checkpoint(target, trainer)
+        shutil.copy(target, kept)
+
+    monkeypatch.setattr("vfr_bake.training.checkpoint.save_checkpoint", keep)
+    assert train_main([str(small_data), str(path), *settings]) == 0
+    shutil.copy(kept, checkpoint_path(path))
+    settings[settings.index("30")] = "10"
+    report = tmp_path / "train.json"
+    again = [*settings, "--resume", "--force", "--json", str(report)]
+    assert train_main([str(small_data), str(path), *again]) == 0
+    assert json.loads(report.read_text())["training_psnr"] is None
+    fast = ["--resolution", "32", "--mesh-resolution", "16", "--check-views", "1", "--refine-steps", "0"]
+    assert bake_main([str(path), str(asset), *fast]) == 0
+
+
+def test_test_views_without_error_are_null_in_json(model: Path, small_data: Path, monkeypatch) -> None:
+    scores = [SimpleNamespace(psnr=np.inf)]
+    monkeypatch.setattr("vfr_bake.training.scores.evaluation.evaluate", lambda *_, **__: iter(scores))
+    figures = _test_figures(load_model(model), load_scene(small_data), 1)
+    assert figures["test_psnr"] is None and figures["test_views"] == 1
+
+
 def test_an_unbounded_model_is_evaluated_and_always_culled(
     small_data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -381,6 +415,32 @@ def test_photographs_without_cameras_have_them_estimated(
     assert train_main([str(photos), str(tmp_path / "model.pt")]) == 1
     one_error(capsys, "found none")
     assert calls == [photos]
+
+
+def test_a_folder_called_demo_is_not_the_built_in_scene(
+    small_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    shutil.copytree(small_data, tmp_path / "demo")
+    assert (_with_cameras("./demo"), _with_cameras("demo/")) == ("./demo", "demo/")
+    assert _with_cameras("demo") == "demo"
+    for name in ("transforms_train.json", "transforms_test.json"):
+        (tmp_path / "demo" / name).unlink()
+    report = PoseReport(Path("demo"), 12, 12, 0.5, 3.0)
+    monkeypatch.setattr("vfr_bake.data.poses.estimate_cameras", lambda *arguments: report)
+    assert _with_cameras("./demo") == "./demo"
+
+
+def test_what_is_masked_in_training_is_masked_in_vfr_eval(small_data: Path, tmp_path: Path) -> None:
+    """With `--kind unbounded`, transparent pixels are masked, also where the model is evaluated later."""
+    model, trained, whole = (tmp_path / name for name in ("model.pt", "train.json", "eval.json"))
+    settings = ["--steps", "20", "--kind", "unbounded", "--batch-rays", "64", "--eval-views", "2", *SMALL]
+    assert train_main([str(small_data), str(model), *settings, "--json", str(trained)]) == 0
+    assert eval_main([str(model), str(small_data), "--json", str(whole)]) == 0
+    first, second = (json.loads(path.read_text()) for path in (trained, whole))
+    assert first["test_psnr"] == pytest.approx(second["psnr"], abs=1e-4)
+    scene = load_scene(small_data)
+    assert not scene.masked and any((image[..., 3] == 0).any() for image in scene.test.images)
 
 
 def test_cameras_that_are_folded_are_told_of(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 from player.cameras.colmap import colmap_folder
 from player.progress import Progress
@@ -23,6 +23,7 @@ from vfr_bake.data.world import scaled
 __all__ = [
     "PosedImages",
     "Scene",
+    "kind_as",
     "load_scene",
     "needs_cameras",
     "reader_as",
@@ -86,6 +87,17 @@ def reader_as(settings: dict[str, Any]) -> PictureReader:
     are recorded in a model or an asset."""
     size = WorkingSize(settings.get("max_side"), settings.get("downscale"))
     return PictureReader(size, on_disk=True)
+
+
+def kind_as(settings: dict[str, Any]) -> SceneKind:
+    """Return the kind of scene that was asked for in a training with these `settings`, as they are recorded
+    in a model or an asset: it decides whether transparent pixels are masked.
+
+    >>> kind_as({"kind": "unbounded"}), kind_as({})
+    ('unbounded', 'auto')
+    """
+    kind = settings.get("kind")
+    return kind if kind in get_args(SceneKind) else "auto"
 
 
 def unpacked(data: str | Path, progress: Progress | None = None) -> Path:

@@ -18,6 +18,7 @@ from player.files.json_files import brief
 from player.progress import Progress
 from vfr_bake.data.capture import Capture, PosedImages, held_out
 from vfr_bake.data.files.estimate_record import read_record
+from vfr_bake.data.files.listing import find_pictures, other_kinds
 from vfr_bake.data.files.masks import mask_of
 from vfr_bake.data.files.opening import SUFFIXES
 from vfr_bake.data.files.orientation import PictureHeader, is_taken_upright, read_layout
@@ -41,9 +42,13 @@ def load_folder(
         return load_transforms_folder(folder, progress, reader)
     if colmap_folder(folder):
         return load_colmap_folder(folder, progress, reader)
-    empty = "an empty folder" if not any(folder.iterdir()) else "neither"
+    if find_pictures(folder)[1]:
+        found = "pictures alone: vfr-train estimates their cameras"
+    else:
+        found = "none of them" if any(folder.iterdir()) else "an empty folder"
     raise DataError(
-        f"{folder}: expected transforms_train.json, transforms.json or sparse/0/images.bin in it, got {empty}"
+        f"{folder}: expected transforms_train.json, transforms.json or sparse/0/images.bin in it, got "
+        f"{found}{other_kinds(folder)}"
     )
 
 

@@ -15,6 +15,7 @@ one stop when they notice.
 from __future__ import annotations
 
 import hashlib
+import os
 import shutil
 import struct
 import threading
@@ -28,7 +29,7 @@ import numpy as np
 
 from vfr_bake.data.features import MAX_FEATURES, Features
 
-VERSION = b"2"
+VERSION = b"3"
 """Version of the records. It changes whenever the same picture would give other features or matches."""
 SIDE = 32
 """Pixels along a side of a thumbnail."""
@@ -59,7 +60,7 @@ def stamp(*files: Path | None) -> bytes:
         if path is None:
             continue
         found = path.stat()
-        told.update(f"{path.resolve()}\0{found.st_size}\0{found.st_mtime_ns}\0".encode())
+        told.update(os.fsencode(path.resolve()) + f"\0{found.st_size}\0{found.st_mtime_ns}\0".encode())
     return told.digest()
 
 
@@ -117,7 +118,7 @@ class KeptMatches:
             for path in root.glob("*/features.bin"):
                 if time.time() - path.stat().st_mtime > MOST_SECONDS:
                     shutil.rmtree(path.parent, ignore_errors=True)
-        name = hashlib.blake2b(str(photos.resolve()).encode(), digest_size=STAMP).hexdigest()
+        name = hashlib.blake2b(os.fsencode(photos.resolve()), digest_size=STAMP).hexdigest()
         return cls(root / name, say)
 
     @property
@@ -130,11 +131,10 @@ class KeptMatches:
 
     def look(self, of: bytes) -> KeptFeatures | None:
         """Return what was found in the picture with the stamp `of`; None if nothing is kept."""
-        at = self._looks.get(of)
-        if at is None:
+        file = self._at(self._looks_path, self._looks, of)
+        if file is None:
             return None
-        with self._looks_path.open("rb") as file:
-            file.seek(at)
+        with file:
             _, sharpness, width, height, n = _LOOK.unpack(file.read(_LOOK.size))
             thumbnail = np.frombuffer(file.read(SIDE * SIDE), np.uint8)
             points = np.frombuffer(file.read(8 * n), "<f4").reshape(n, 2).astype(np.float64)
@@ -151,11 +151,10 @@ class KeptMatches:
     def matches(self, a: bytes, b: bytes, n_a: int, n_b: int) -> np.ndarray | None:
         """Return the matches [n, 2] uint32 of the pictures with the stamps `a` and `b`, which have `n_a` and
         `n_b` features; None if none are kept."""
-        at = self._matches.get(a + b)
-        if at is None:
+        file = self._at(self._matches_path, self._matches, a + b)
+        if file is None:
             return None
-        with self._matches_path.open("rb") as file:
-            file.seek(at)
+        with file:
             n = _MATCHES.unpack(file.read(_MATCHES.size))[-1]
             found = np.frombuffer(file.read(_BYTES_A_MATCH * n), "<u4").reshape(n, 2)
         return found if (found < (n_a, n_b)).all() else None
@@ -164,6 +163,18 @@ class KeptMatches:
         """Keep the `matches` [n, 2] of the pictures with the stamps `a` and `b`."""
         record = _MATCHES.pack(a, b, len(matches)) + matches.astype("<u4").tobytes()
         self._append(self._matches_path, self._matches, a + b, record)
+
+    def _at(self, path: Path, index: dict[bytes, int], key: bytes) -> BinaryIO | None:
+        """Open a file at the record of `key`; None if there is no such record, or another process, which is
+        done with the same pictures, has deleted the file."""
+        if key not in index:
+            return None
+        try:
+            file = path.open("rb")
+        except FileNotFoundError:
+            return None
+        file.seek(index[key])
+        return file
 
     def _append(self, path: Path, index: dict[bytes, int], key: bytes, record: bytes) -> None:
         with self._lock:

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from player.cameras.colmap import FOLDERS, MAX_FILE_BYTES, colmap_folder
+from player.cameras.colmap import FOLDERS, MAX_FILE_BYTES, colmap_folder, read_images
 from player.cameras.rotations import OPENGL_FROM_OPENCV
 from player.errors import DataError, FormatError, OutputError
 from player.files.files import check_target, new_folder, read_bytes
@@ -208,11 +208,28 @@ def estimate_cameras(
     placed = _names_in(models[0])
     apart = tuple(n for other in models[1:] if (n := len(_names_in(other) - placed)) >= MIN_PICTURES)
     reasons = why_unplaced(names, features, pairs, models)
+    if model.exists():  # another process was faster
+        return _read_report(model, photos, len(pictures))
     with new_folder(model) as new:
         models[0].write_binary(str(new))
         write_record(new, EstimateRecord(True, left_out, reasons, apart))
     known.remove()
     return _read_report(model, photos, len(pictures))
+
+
+def added_since(photos: Path) -> list[str]:
+    """Return the names of the pictures in a folder that `estimate_cameras` has not seen, because they were
+    added later; empty if the cameras were not estimated by it.
+
+    >>> added_since(Path("surely/not/there"))
+    []
+    """
+    model = photos / "sparse" / "0"
+    if not (model / "images.bin").is_file() or not (record := read_record(model)).upright:
+        return []
+    seen = {image.name for image in read_images(model / "images.bin")} | {*record.repeated, *record.unplaced}
+    place, pictures = find_pictures(photos)
+    return [name for path in pictures if (name := path.relative_to(place).as_posix()) not in seen]
 
 
 def _refuse_text(photos: Path) -> None:

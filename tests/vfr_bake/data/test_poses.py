@@ -19,7 +19,7 @@ from vfr_bake.data import mapping, poses
 from vfr_bake.data.check.check import check_data
 from vfr_bake.data.features import find_features, match
 from vfr_bake.data.folders import load_folder
-from vfr_bake.data.poses import estimate_cameras, has_pictures
+from vfr_bake.data.poses import added_since, estimate_cameras, has_pictures
 from vfr_bake.data.store.working import WorkingSize
 
 N_CAN = 10
@@ -215,6 +215,32 @@ def test_an_interrupted_estimation_goes_on_where_it_was(can, tmp_path: Path, kep
     assert estimate_cameras(photos, quiet).n_registered == 6
     assert (len(looked), len(matched)) == (1, 5)  # only those of the new picture
     assert not list(kept.rglob("*.bin"))
+
+
+def test_pictures_that_are_added_later_are_told_of(can, tmp_path: Path) -> None:
+    photos = first_pictures(can, tmp_path, 4)
+    shutil.copytree(can[0] / "sparse", photos / "sparse")
+    assert added_since(photos) == []
+    shutil.copy(min(photos.glob("*.jpg")), photos / "new.jpg")
+    assert added_since(photos) == ["new.jpg"]
+    checked = check_data(str(photos), WorkingSize(), 60.0)
+    (new,) = (picture for picture in checked.pictures if picture.name == "new.jpg")
+    assert new.found is False and "added after the cameras were estimated" in str(new.why)
+    (photos / "sparse" / "0" / "pictures.json").unlink()  # cameras of another program
+    assert added_since(photos) == []
+
+
+def test_of_two_estimations_the_slower_one_takes_what_the_other_found(
+    can, tmp_path: Path, monkeypatch
+) -> None:
+    photos = first_pictures(can, tmp_path, 4)
+
+    def overtaken(*arguments: object) -> dict[str, str]:
+        shutil.copytree(can[0] / "sparse", photos / "sparse")
+        return {}
+
+    monkeypatch.setattr(poses, "why_unplaced", overtaken)
+    assert estimate_cameras(photos, quiet).n_registered == can[1].n_registered
 
 
 def test_a_folder_that_cannot_be_written_is_refused_at_once(tmp_path: Path, monkeypatch):

@@ -190,8 +190,10 @@ def test_empty_folder_and_folder_without_transforms(tmp_path: Path):
         f"{tmp_path}: expected transforms_train.json, transforms.json or sparse/0/images.bin in it, got "
     )
     assert message(tmp_path) == expected + "an empty folder"
+    (tmp_path / "IMG_1.DNG").write_bytes(b"")
+    assert message(tmp_path) == expected + "none of them; there are .dng files: save them as JPEG"
     (tmp_path / "picture.png").write_bytes(b"")
-    assert message(tmp_path) == expected + "neither"
+    assert (expected + "pictures alone: vfr-train estimates their cameras") in message(tmp_path)
 
 
 def test_no_frames(tmp_path: Path):

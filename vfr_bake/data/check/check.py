@@ -26,7 +26,7 @@ from vfr_bake.data.files.listing import find_pictures
 from vfr_bake.data.files.pictures import DescribedView, picture_size
 from vfr_bake.data.files.video import extract_frames
 from vfr_bake.data.folders import has_transforms, load_folder
-from vfr_bake.data.poses import is_video
+from vfr_bake.data.poses import added_since, is_video
 from vfr_bake.data.quality.sharpness import blurred
 from vfr_bake.data.store.reading import PictureReader
 from vfr_bake.data.store.working import WorkingSize
@@ -203,6 +203,8 @@ def _listed(data: str) -> _Set:
             why = record.unplaced | {
                 name: f"shows what {kept} does" for name, kept in record.repeated.items()
             }
+            new = f"added after the cameras were estimated: remove {folder / 'sparse'} to use it"
+            why |= dict.fromkeys(added_since(folder), new)
         return _Set(kind, names, paths, found, cameras, why)
     place, paths = find_pictures(folder)
     if not paths:

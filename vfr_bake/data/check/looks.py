@@ -19,6 +19,7 @@ from vfr_bake.data.check.turning import MIN_MATCHES, OFF
 from vfr_bake.data.features import match
 from vfr_bake.data.files.pictures import (
     SHARPNESS_SIDE,
+    decoding_bytes,
     enough_for,
     opencv,
     picture_size,
@@ -145,7 +146,8 @@ def look_at(
             return number, str(error)
 
     seen: list[PictureMeasures | str | None] = [None] * len(paths)
-    for done, (number, found) in enumerate(one_by_one(looked, order, n_threads())):
+    most_bytes = max((decoding_bytes(paths[number], SHARPNESS_SIDE) for number in order), default=1)
+    for done, (number, found) in enumerate(one_by_one(looked, order, n_threads(most_bytes))):
         seen[number] = found
         if progress is not None:
             progress(done + 1, len(order))

@@ -16,6 +16,7 @@ from player.errors import DataError, OutputError
 from player.files.files import new_folder
 from player.progress import Progress
 from vfr_bake.data.files.opening import SUFFIXES
+from vfr_bake.data.files.source import check_source, note_source
 
 SUFFIX = ".zip"
 KEPT = (*SUFFIXES, ".bmp", ".json", ".bin")
@@ -59,14 +60,15 @@ def unpack(archive: Path, progress: Progress) -> Path:
     Returns the folder to load: the new folder, or the one inside it if that is all it contains.
 
     `progress`: called with the number of files unpacked and to unpack. The folder appears when it is
-    complete; one that exists is used as it is.
+    complete; one that was unpacked before is used as it is.
 
     Raises DataError: not a ZIP, damaged, with a password, no pictures in it, a name that leaves the folder or
-    that not every system can write, a link, or more bytes than it may unpack to; OutputError: the disk is too
-    full.
+    that not every system can write, a link, more bytes than it may unpack to, or a folder that another ZIP
+    was unpacked to; OutputError: the disk is too full.
     """
     folder = unpacked_folder(archive)
     if folder.is_dir():
+        check_source(folder, archive)
         return _inner(folder)
     try:
         with zipfile.ZipFile(archive) as file:
@@ -75,6 +77,7 @@ def unpack(archive: Path, progress: Progress) -> Path:
                 for done, (entry, name) in enumerate(entries, start=1):
                     _unpack_one(archive, file, entry, new / name)
                     progress(done, len(entries))
+                note_source(new, archive)
     except _DAMAGED as error:
         reason = (str(error).splitlines() or [type(error).__name__])[0]
         raise DataError(
@@ -165,9 +168,11 @@ def _twice(names: list[str]) -> str:
 
 def _inner(folder: Path) -> Path:
     """Return the folder itself, or, as long as a folder has nothing but one other folder in it, that one:
-    phones pack a folder instead of its contents. A folder `images` is not entered."""
+    phones pack a folder instead of its contents. A folder `images` is not entered. Files of other kinds, such
+    as systems leave behind when a folder is looked at, do not count."""
     while True:
-        inside = list(folder.iterdir())
+        shown = (path for path in folder.iterdir() if path.name[0] != ".")
+        inside = [path for path in shown if path.is_dir() or path.suffix.lower() in KEPT]
         if len(inside) != 1 or not inside[0].is_dir() or inside[0].name == "images":
             return folder
         folder = inside[0]

@@ -53,10 +53,10 @@ def _below(place: Path) -> list[Path]:
             )
     for path in found:
         try:
-            path.name.encode()
+            path.relative_to(place).as_posix().encode()
         except UnicodeEncodeError:
             raise DataError(
-                f"{str(path)!a}: expected a name in UTF-8: give the picture another one"
+                f"{str(path)!a}: expected a name in UTF-8: give the picture or its folder another one"
             ) from None
     return found
 

@@ -15,7 +15,14 @@ from vfr_bake.data import threads
 from vfr_bake.data.features import MAX_SIDE, Features, find_features
 from vfr_bake.data.files.masks import apply_mask
 from vfr_bake.data.files.opening import exif_of, open_photograph
-from vfr_bake.data.files.pictures import enough_for, opencv, picture_size, read_picture, sharpness
+from vfr_bake.data.files.pictures import (
+    decoding_bytes,
+    enough_for,
+    opencv,
+    picture_size,
+    read_picture,
+    sharpness,
+)
 from vfr_bake.data.kept_matches import SIDE, KeptFeatures, KeptMatches, stamp
 from vfr_bake.data.mapping import Sensor
 
@@ -47,7 +54,9 @@ def look_at(
         sensor = sensor_of(path, found.width, found.height)
         return Look(sensor, found.features, found.thumbnail.astype(np.float32), found.sharpness)
 
-    return threads.in_threads(look, pictures, progress)
+    sides = (MAX_SIDE if mask is None else None for _, mask in pictures)
+    most = max(map(decoding_bytes, (path for path, _ in pictures), sides), default=1)
+    return threads.in_threads(look, pictures, progress, most)
 
 
 def _found_in(path: Path, mask: Path | None) -> KeptFeatures:

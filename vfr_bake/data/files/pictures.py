@@ -16,10 +16,14 @@ from player.files.images import MAX_FILE_BYTES
 from vfr_bake.data.capture import PosedImages
 from vfr_bake.data.files.opening import open_photograph
 from vfr_bake.data.files.orientation import as_stored, layout_of, read_layout, turned_upright
+from vfr_bake.data.files.profiles import as_srgb
 
 SHARPNESS_SIDE = 800
 """Pixels of the longest side at which sharpness is measured. Blur that does not show at this size is below
 two pixels at the working size."""
+
+BYTES_DECODED = 16
+"""Bytes of memory for each decoded pixel while its picture is read."""
 
 
 class DescribedView(NamedTuple):
@@ -108,9 +112,22 @@ def enough_for(size: tuple[int, int], side: int) -> tuple[int, int]:
     return max(1, round(size[0] * scale)), max(1, round(size[1] * scale))
 
 
+def decoding_bytes(path: Path, side: int | None = None) -> int:
+    """Return the approximate number of bytes of memory that are taken while a picture is read at its own
+    size, or, with a `side`, as `read_picture` reads it if that many pixels along a side are enough. It is 1
+    for a file that cannot be read."""
+    try:
+        with open_photograph(path) as file:
+            if side is not None:
+                file.draft(None, enough_for(file.size, side))
+            return file.size[0] * file.size[1] * BYTES_DECODED
+    except (FormatError, MissingExtraError):
+        return 1
+
+
 def read_picture(path: Path, upright: bool = False, least: tuple[int, int] | None = None) -> np.ndarray:
     """Read a picture as [height, width, 4] uint8, sRGB and straight alpha; grey, palette and 16-bit pictures
-    too.
+    and those with another colour profile, too.
 
     `upright`: the picture is turned as EXIF says that it is to be looked at; otherwise it is as stored.
     `least`: a width and height that are enough for the returned picture. A JPEG file that is twice, four or
@@ -126,6 +143,7 @@ def read_picture(path: Path, upright: bool = False, least: tuple[int, int] | Non
                 swapped = upright != layout.turned and layout.number >= 5
                 file.draft(None, (least[1], least[0]) if swapped else least)
             rgba = _read_16_bit_colour(path) if _is_16_bit_colour(path) else _decoded(path, file)
+            rgba = as_srgb(rgba, file.info.get("icc_profile"))
     except FormatError as error:
         raise DataError(str(error)) from error
     if layout.turned == upright:

@@ -19,6 +19,7 @@ from player.errors import DataError
 from player.files.files import new_folder
 from player.progress import Progress
 from vfr_bake.data.files.pictures import opencv, sharpness, shrunk
+from vfr_bake.data.files.source import check_source, note_source
 
 SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
 STEP = 0.03
@@ -48,13 +49,15 @@ def extract_frames(video: Path, progress: Progress) -> Path:
 
     Each is the sharpest of a stretch in which the picture has moved by the same share of its size, because a
     hand-held camera shakes, and one frame in three is blurred. `progress`: called with the number of frames
-    looked at and to look at. The folder appears when it is complete; one that exists is used as it is.
-    Returns the folder.
+    looked at and to look at. The folder appears when it is complete; one that was made before is used as it
+    is. Returns the folder.
 
-    Raises DataError (not a video, no frames), OutputError, MissingExtraError.
+    Raises DataError (not a video, no frames, a folder with the frames of another video), OutputError,
+    MissingExtraError.
     """
     folder = frames_folder(video)
     if (folder / "images").is_dir():
+        check_source(folder, video)
         return folder
     cv2 = opencv(f"{video}: video: expected OpenCV to read it")
     # OpenCV turns the frames upright where the file says how the camera was held.
@@ -76,6 +79,7 @@ def extract_frames(video: Path, progress: Progress) -> Path:
                 read, frame = capture.read()
             stretches.finish()
             progress(n_read, n_read)
+            note_source(new, video)
     finally:
         capture.release()
     return folder

@@ -30,8 +30,6 @@ from vfr_bake.data.threads import in_threads, n_threads, one_by_one
 HELD_BYTES = 1_000_000_000
 """Pictures are held in memory if they take no more than this, and no more than a quarter of what the program
 may use: the trainer has another copy of those that it learns from."""
-DECODING_BYTES = 1_000_000_000
-"""Memory for pictures that are being decoded: the larger they are, the fewer threads read them."""
 LEAST_SIDE = 480
 """Pixels: the longest side is not made smaller than this for want of room."""
 STEP = 16
@@ -138,8 +136,7 @@ class PictureReader:
         self._say(f"{len(sizes)} pictures of {_named(sizes)}{smaller}{where}")
 
     def _threads(self, described: Sequence[DescribedView], sizes: Sequence[tuple[int, int]]) -> int:
-        largest = max(map(self.size.reading_bytes, described, sizes), default=1)
-        return max(1, min(n_threads(), DECODING_BYTES // largest))
+        return n_threads(max(map(self.size.reading_bytes, described, sizes), default=1))
 
     def _held(
         self, described: Sequence[DescribedView], sizes: Sequence[tuple[int, int]], progress: Progress | None

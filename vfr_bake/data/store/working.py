@@ -14,6 +14,7 @@ from player.cameras.camera import Camera
 from vfr_bake.data.capture import PosedImages
 from vfr_bake.data.files.masks import apply_mask
 from vfr_bake.data.files.pictures import (
+    BYTES_DECODED,
     DescribedView,
     opencv,
     premultiplied,
@@ -27,8 +28,8 @@ from vfr_bake.data.files.pictures import (
 MAX_SIDE = 1600
 """Pixels of the longest side, if nothing else is asked for: a capture's field resolves no finer detail in the
 minutes that it is trained for, and twelve megapixels take six times the room."""
-BYTES_DECODED, BYTES_UNDISTORTED = 16, 100
-"""Bytes of memory for each decoded pixel while its picture is read, and while lens distortion is undone."""
+BYTES_UNDISTORTED = 100
+"""Bytes of memory for each pixel while lens distortion is undone."""
 
 
 @dataclass(frozen=True)

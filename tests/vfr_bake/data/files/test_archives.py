@@ -52,8 +52,21 @@ def test_a_zip_as_phones_share_it(tmp_path: Path) -> None:
         "\u56fe\u7247/a.png",
     ]
     assert needs_cameras(folder) and not (tmp_path / "__MACOSX").exists()
-    archive.write_bytes(b"")  # what has been unpacked is used as it is
+    (folder.parent / ".DS_Store").write_bytes(b"")  # as systems leave behind when a folder is looked at
+    (folder.parent / "desktop.ini").write_bytes(b"")
     assert unpacked(archive) == folder
+
+
+def test_another_zip_of_the_same_name_is_not_taken_for_the_one_that_was_unpacked(tmp_path: Path) -> None:
+    archive = pack(tmp_path / "photos.zip", {"a.png": picture()})
+    folder = unpack(archive, quiet)
+    pack(archive, {"a.png": picture(), "b.png": picture()})
+    with pytest.raises(
+        DataError, match=r"photos_unpacked: expected to be made from photos\.zip as it is now"
+    ):
+        unpack(archive, quiet)
+    (folder / "source.txt").unlink()  # as an earlier version left it
+    assert unpack(archive, quiet) == folder
 
 
 def test_a_zip_of_a_data_set(small_data: Path, tmp_path: Path) -> None:
@@ -69,7 +82,7 @@ def test_names_of_what_stays_packed_do_not_matter(tmp_path: Path) -> None:
     """Names of entries that stay packed do not matter, such as that of macOS' icon, with a return in it."""
     files = dict.fromkeys(["IMG_1.png", "Icon\r", "notes 12:30.txt", "__MACOSX/a 12:30.png"], picture())
     folder = unpack(pack(tmp_path / "a.zip", files), quiet)
-    assert [path.name for path in folder.iterdir()] == ["IMG_1.png"]
+    assert sorted(path.name for path in folder.iterdir()) == ["IMG_1.png", "source.txt"]
 
 
 def link(path: Path) -> None:

@@ -46,6 +46,7 @@ def test_a_whole_disk_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 def test_a_name_that_is_no_text(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A file name that is not UTF-8, as Linux allows and other systems do not, is refused."""
     monkeypatch.setattr(Path, "is_file", lambda path: True)
-    monkeypatch.setattr(os, "walk", lambda place: [(str(place), [], ["\udcff.png"])])
-    with pytest.raises(DataError, match="expected a name in UTF-8"):
-        find_pictures(tmp_path)
+    for folder, name in (("", "\udcff.png"), ("M\udcfcnchen", "a.png")):
+        monkeypatch.setattr(os, "walk", lambda place, at=folder, name=name: [(f"{place}/{at}", [], [name])])
+        with pytest.raises(DataError, match="expected a name in UTF-8"):
+            find_pictures(tmp_path)

@@ -3,16 +3,19 @@ the picture, and if a part of its pixels is decoded only."""
 
 from __future__ import annotations
 
+import struct
 from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, ImageCms
 
 from player.progress import Progress
 from tests.vfr_bake.data.files.test_orientation import save_turned
+from vfr_bake.data import threads
 from vfr_bake.data.features import find_features, match
 from vfr_bake.data.files.looks import look_at
+from vfr_bake.data.files.pictures import decoding_bytes, read_picture
 from vfr_bake.data.kept_matches import KeptMatches
 
 
@@ -61,3 +64,68 @@ def test_what_is_kept_is_not_looked_at_again(tmp_path: Path, monkeypatch: pytest
     monkeypatch.setattr("vfr_bake.data.files.looks.find_features", None)
     (again,) = look_at([(tmp_path / "a.png", None)], KeptMatches(tmp_path / "kept"), progress)
     assert again.sharpness == first.sharpness and np.array_equal(again.features.sift, first.features.sift)
+
+
+def test_large_pictures_are_decoded_by_fewer_threads(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A JPEG is decoded at a part of its size, a PNG and a picture with a mask as a whole."""
+    monkeypatch.setattr(threads, "default_threads", lambda: 8)
+    monkeypatch.setattr(threads, "MOST_BYTES", 4 * 3840 * 2560 * 16)
+    paths = [tmp_path / "large.jpg", tmp_path / "large.png", tmp_path / "no_picture.jpg"]
+    for path in paths[:2]:
+        Image.new("RGB", (3840, 2560)).save(path)
+    paths[2].write_bytes(b"")
+    part, whole, none = (decoding_bytes(path, 1600) for path in paths)
+    assert (part, whole, none) == (1920 * 1280 * 16, 3840 * 2560 * 16, 1)
+    assert decoding_bytes(paths[0]) == whole
+    assert [threads.n_threads(n) for n in (part, whole, none, 10 * whole)] == [8, 4, 8, 1]
+
+
+def profile_like(primaries: list[tuple[float, float, float]]) -> bytes:
+    """Return an ICC profile with sRGB's curves and other `primaries` (XYZ under D50 of red, green, blue)."""
+    profile = bytearray(ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes())
+    (n_tags,) = struct.unpack_from(">I", profile, 128)
+    tags = {bytes(profile[at : at + 4]): struct.unpack_from(">I", profile, at + 4)[0]
+            for at in range(132, 132 + 12 * n_tags, 12)}  # fmt: skip
+    for name, xyz in zip((b"rXYZ", b"gXYZ", b"bXYZ"), primaries, strict=True):
+        struct.pack_into(">3i", profile, tags[name] + 8, *(round(65536 * value) for value in xyz))
+    return bytes(profile).replace("sRGB".encode("utf-16-be"), "wide".encode("utf-16-be"))
+
+
+DISPLAY_P3 = [(0.51512, 0.2412, -0.00105), (0.29198, 0.69225, 0.04189), (0.1571, 0.06657, 0.78407)]
+SRGB = [(0.43607, 0.22249, 0.01392), (0.38515, 0.71687, 0.09708), (0.14307, 0.06061, 0.71410)]
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg", ".webp", ".tif"])
+def test_colours_of_another_profile_become_srgb(suffix: str, tmp_path: Path) -> None:
+    """The same colours, written as Display P3 and as sRGB, are read as the same picture."""
+    random = np.random.default_rng(0)
+    linear = random.uniform(0.05, 0.6, (4, 5, 3))
+    to_p3 = np.linalg.solve(np.array(DISPLAY_P3).T, np.array(SRGB).T)
+
+    def encoded(colours: np.ndarray) -> np.ndarray:
+        values = np.where(colours <= 0.0031308, 12.92 * colours, 1.055 * colours ** (1 / 2.4) - 0.055)
+        return np.rint(255 * values.clip(0, 1)).astype(np.uint8).repeat(16, axis=0).repeat(16, axis=1)
+
+    lossless = {"lossless": True} if suffix == ".webp" else {"quality": 100, "subsampling": 0}
+    path = tmp_path / f"a{suffix}"
+    wide = Image.fromarray(encoded(linear @ to_p3.T))
+    wide.save(path, icc_profile=profile_like(DISPLAY_P3), **lossless)
+    read = read_picture(path).astype(int)
+    assert (read[..., 3] == 255).all()
+    assert np.abs(read[8::16, 8::16, :3] - encoded(linear)[8::16, 8::16]).max() <= (
+        4 if suffix == ".jpg" else 2
+    )
+    assert np.abs(np.asarray(wide).astype(int) - encoded(linear)).max() > 8, "profiles would not matter"
+
+
+def test_a_picture_in_srgb_is_read_bit_for_bit(tmp_path: Path) -> None:
+    colours = blots(40, 30)
+    alpha = np.random.default_rng(1).integers(0, 256, (30, 40, 1), np.uint8)
+    rgba = np.concatenate([colours, alpha], axis=-1)
+    own = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
+    for name, profile in (("own", own), ("damaged", own[:200]), ("none", b"")):
+        Image.fromarray(rgba).save(tmp_path / f"{name}.png", icc_profile=profile)
+        assert np.array_equal(read_picture(tmp_path / f"{name}.png"), rgba)
+    Image.fromarray(rgba).save(tmp_path / "wide.png", icc_profile=profile_like(DISPLAY_P3))
+    wide = read_picture(tmp_path / "wide.png")
+    assert np.array_equal(wide[..., 3:], alpha) and not np.array_equal(wide[..., :3], colours)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from player.errors import DataError
 from tests.vfr_bake.data.test_poses import message, quiet, textured
 from vfr_bake.data import poses
 from vfr_bake.data.files import video
@@ -44,8 +45,10 @@ def test_the_sharpest_frame_of_every_step(short_video: Path):
     assert folder == short_video.with_name("walk_frames") and calls[-1] == (12, 12)
     numbers = frame_numbers(folder / "images")
     assert not any(number % 2 for number in numbers) and 5 <= len(numbers) <= 6
-    short_video.unlink()  # frames that are there are used as they are
-    assert video.extract_frames(short_video, quiet_frames) == folder
+    assert video.extract_frames(short_video, quiet_frames) == folder  # they are used as they are
+    other = short_video.rename(short_video.with_suffix(".mov"))
+    with pytest.raises(DataError, match=r"walk_frames: expected to be made from walk\.mov"):
+        video.extract_frames(other, quiet_frames)
 
 
 def quiet_frames(done: int, of: int) -> None:

@@ -1,0 +1,36 @@
+"""The file that a folder was made from, a ZIP or a video. It is noted in the folder, so that the folder is
+not taken for that of another file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from player.errors import DataError
+from player.files.files import read_bytes
+
+NAME = "source.txt"
+"""Name of the file that has the name of the source and its size in bytes, one a line."""
+
+
+def note_source(folder: Path, source: Path) -> None:
+    """Note in `folder` that it is made from the file `source`."""
+    (folder / NAME).write_text(_note(source), encoding="utf-8")
+
+
+def check_source(folder: Path, source: Path) -> None:
+    """Raise DataError if `folder` has a note that it was made from another file than `source`. A folder
+    without a note is trusted, and so is one whose source is gone."""
+    path = folder / NAME
+    if (
+        path.exists()
+        and source.exists()
+        and read_bytes(path, "the name of a file", 10_000) != _note(source).encode()
+    ):
+        raise DataError(
+            f"{folder}: expected to be made from {source.name} as it is now, got a folder that was made from "
+            "another file: remove it, or name the folder itself to use it"
+        )
+
+
+def _note(source: Path) -> str:
+    return f"{source.name!a}\n{source.stat().st_size}\n"
