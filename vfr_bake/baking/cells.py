@@ -37,6 +37,10 @@ sphere of an unbounded scene. Cells of a box that are missed nevertheless are ga
 MOST_SEEING = 2_000_000
 """Most rays that search for the cells of an unbounded scene. It bounds the time, however many views there are
 and wherever they stand. Fox needs 1.2 million rays for CONTRACTED_HITS hits."""
+LEAST_DISTANCE = 0.5
+"""Distance, model units, at which a camera of an unbounded scene counts at least. A camera at the origin, as
+in a walk through a room, would seem to meet every block by itself, although it stands a unit away from those
+at the unit sphere."""
 VIEWS_OF_A_CELL = 0.4
 """Rough share of the training views that see a given piece of surface."""
 BLOCK = 2
@@ -255,10 +259,11 @@ def occupied_cells(model: Model, resolution: int) -> np.ndarray:
     return cells
 
 
-def pixel_footprints(model: Model) -> np.ndarray:
-    """Return [n_views]: the size of each training camera's pixels at the middle of the box, model units."""
+def pixel_footprints(model: Model, least_distance: float = 1e-6) -> np.ndarray:
+    """Return [n_views]: the size of each training camera's pixels at the origin of the model frame, model
+    units. Cameras count as at least `least_distance` away from it."""
     cameras = model.model_cameras()
-    return np.array([max(float(np.linalg.norm(c.c2w[:3, 3])), 1e-6) / c.fx for c in cameras])
+    return np.array([max(float(np.linalg.norm(c.c2w[:3, 3])), least_distance) / c.fx for c in cameras])
 
 
 def rays_of_views(model: Model, resolution: int) -> float:
@@ -303,7 +308,10 @@ def beside(cells: np.ndarray) -> np.ndarray:
     >>> int(beside(one).sum())
     7
     """
-    return np.logical_or.reduce([_any_of_three(cells, axis) for axis in range(3)])
+    found = cells.copy()
+    for axis in range(3):
+        found |= _any_of_three(cells, axis)
+    return found
 
 
 def _any_of_three(cells: np.ndarray, axis: int) -> np.ndarray:
@@ -388,7 +396,7 @@ def _pixels_of_contracted_views(model: Model) -> float:
 
 
 def _share_of_pixels(model: Model, resolution: int) -> float:
-    footprints = np.tile(pixel_footprints(model), 1 + BETWEEN)
+    footprints = np.tile(pixel_footprints(model, LEAST_DISTANCE), 1 + BETWEEN)
     hits = VIEWS_OF_A_CELL * float(np.sum((4 * BLOCK / resolution / footprints) ** 2))
     return min(CONTRACTED_HITS / hits, MOST_SEEING / _pixels_of_contracted_views(model), 1.0)
 

@@ -201,7 +201,8 @@ class HeldOut:
         )
         self.own = self._compared(self.wanted)
         """The model's own pictures, with their errors."""
-        self._model_psnr = float(model.figures.get("training_psnr") or DEFAULT_PSNR)
+        psnr = float(model.figures.get("training_psnr") or DEFAULT_PSNR)
+        self._model_psnr = psnr if np.isfinite(psnr) else DEFAULT_PSNR
         self.stages: list[Stage] = []
 
     @property

@@ -94,6 +94,10 @@ COMPILE_SECONDS = 45.0
 """Seconds that the first bake after an installation spends on compiling its code: about half a minute of the
 bake of `make demo` with AVX-512, and a minute without."""
 
+CULLING_BYTES = 8
+"""Bytes that each cell of a box takes while cells are left out, beside a mark for each floor: those that may
+hold matter, those that weigh enough, their neighbours, and distances to them."""
+
 
 @dataclass(frozen=True)
 class Plan:
@@ -193,8 +197,9 @@ def _marks_bytes(model: Model, config: BakeConfig) -> float:
     """Return the bytes that each cell of the features' grid takes while the stored cells are found."""
     unbounded = model.field.config.unbounded
     n_floors = len(FLOORS) if config.weight_floor is None and not unbounded else 1
-    n_bytes = 4 + (0 if config.no_cull else n_floors)
-    return n_bytes / BLOCK**3 if unbounded else n_bytes
+    if unbounded:
+        return (4 + (0 if config.no_cull else n_floors)) / BLOCK**3
+    return 4 if config.no_cull else CULLING_BYTES + n_floors
 
 
 def _cells(model: Model, resolution: int) -> float:
@@ -215,10 +220,11 @@ def expected_seconds(model: Model, config: BakeConfig, plan: Plan) -> float:
     choice, unbounded = config.choice(model.field.config.unbounded), model.field.config.unbounded
     every = model.model_cameras()
     views = every[:: -(-len(every) // VIEWS_TIMED)]
-    n_rays = max(plan.n_rays(plan.n_cells) // ((1 + BETWEEN) * len(every)), 1) * len(views)
-    render_teacher(model, views, n_rays, 0, lambda done, of: None)  # compiles the code
+    a_view = max(plan.n_rays(plan.n_cells) // ((1 + BETWEEN) * len(every)), 1)
+    n_rays = sum(min(a_view, camera.width * camera.height) for camera in views)
+    render_teacher(model, views, a_view * len(views), 0, lambda done, of: None)  # compiles the code
     begin = time.perf_counter()
-    shown = render_teacher(model, views, n_rays, 1, lambda done, of: None)
+    shown = render_teacher(model, views, a_view * len(views), 1, lambda done, of: None)
     ray_seconds = (time.perf_counter() - begin) / n_rays
     fine, coarse = plan.resolutions
     n_all, met = plan.n_rays(plan.n_cells), len(shown.opacity) / n_rays

@@ -67,15 +67,16 @@ class ComparedView:
 
 
 def compared_views(model: Model, n_views: int) -> list[ComparedView]:
-    """Return the views whose whole pictures are witnesses, as many as MOST_PIXELS allows. If there are none,
-    return `n_views` views between the training cameras."""
+    """Return the views whose whole pictures are witnesses, as many as MOST_PIXELS allows. If there are none
+    that show anything, return `n_views` views between the training cameras."""
     witnesses = model.neutral_witnesses()
-    if witnesses is None or not len(witnesses.whole):
+    numbers = np.zeros(0, np.int64) if witnesses is None else witnesses.views()
+    if witnesses is None or not np.isin(witnesses.whole, numbers).any():
         between = (view.transformed(model.world_from_model) for view in views_between(model, n_views, SEED))
         small = [camera.at_most(LONGEST_SIDE) for camera in between]
         return [ComparedView(camera, np.arange(camera.width * camera.height), None) for camera in small]
-    found, numbers, n_pixels = [], witnesses.views(), 0
-    for number in witnesses.whole:
+    found, n_pixels = [], 0
+    for number in witnesses.whole[np.isin(witnesses.whole, numbers)]:
         camera, rows = model.cameras[number], numbers == number
         n_pixels += camera.width * camera.height
         if found and n_pixels > MOST_PIXELS:

@@ -165,7 +165,7 @@ class Tuning:
         grid = layout.grid(stored.density, stored.features)
         if choice.refine_steps == 0:
             self.kept = self._choose_lookups_and_bits(stored, grid, teacher)
-            return stored
+            return self._in_enough_bits(stored, stored)
         head_rate, code_rate = HEAD_RATE, CODE_RATE * choice.code_levels / 127
         before = self._held_out.stages[-1]
         densities = grid.rows if layout.densities is layout.features else layout.densities.rows()
@@ -242,9 +242,12 @@ class Tuning:
         after = self._held_out.measure("refined at k", grid, head, self.n_fetches)
         if self._gained("refinement at k", self.kept, after):
             self.kept = after
-            return tuned
-        move_towards(stored.features, with_remainders(played, left), 1.0)
-        return stored
+        else:
+            tuned = stored
+        chosen = self._in_enough_bits(stored, tuned)
+        if chosen is stored:
+            move_towards(stored.features, with_remainders(played, left), 1.0)
+        return chosen
 
     @contextmanager
     def _steps(self, name: str, asked: int) -> Iterator[Steps]:

@@ -36,7 +36,7 @@ from vfr_bake.baking.distillation import (
     player_fetches,
 )
 from vfr_bake.baking.grids import code_step, head_sensitivity, latent, project, whole_codes
-from vfr_bake.baking.head import FoldedHead, fold_head
+from vfr_bake.baking.head import FoldedHead, fold_head, runner
 from vfr_bake.baking.held_out import views_between
 from vfr_bake.baking.refinement import (
     BATCH,
@@ -246,9 +246,12 @@ def test_a_round_that_gains_nothing_leaves_what_was_stored(
 
 
 @pytest.mark.parametrize("share", [-1e9, 1e9])
+@pytest.mark.parametrize("worth", [-np.inf, np.inf])
 def test_a_head_in_8_bits_that_loses_too_much_is_played_in_float32(
-    share: float, model: Model, monkeypatch: pytest.MonkeyPatch
+    share: float, worth: float, model: Model, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """The head stays in float32 if 8 bits lose too much, whether the head alone is trained with the lookups
+    that are played, or the features, too."""
     config = BakeConfig(resolution=48, check_views=1, head_width=0, head_bits=8, k=4, refine_steps=20)
     work = _Bake(model, config, quiet)
     layout, _ = work._cells()
@@ -257,11 +260,14 @@ def test_a_head_in_8_bits_that_loses_too_much_is_played_in_float32(
     monkeypatch.setattr(work.held_out, "lost", lambda before, after: Loss(0.2, 0.0))
     monkeypatch.setattr("vfr_bake.baking.refinement.BITS_SHARE", share)
     monkeypatch.setattr("vfr_bake.baking.refinement.ROUNDING_LEFT", -np.inf)  # 8 bits are tried
-    monkeypatch.setattr("vfr_bake.baking.refinement.WORTH_FEATURES", np.inf)
+    monkeypatch.setattr("vfr_bake.baking.refinement.WORTH_FEATURES", worth)
     monkeypatch.setattr("vfr_bake.baking.refinement.Tuning._gained", lambda *_: True)
-    tuning = Tuning(config, work.choice, work.held_out, lambda name: lambda done, of: None, 60.0)
-    tuning.run(stored, layout, teacher, again)
+    tuning = Tuning(config, work.choice, work.held_out, lambda name: lambda done, of: None, 600.0)
+    left = tuning.run(stored, layout, teacher, again)
     assert (tuning.ranges is None) == (share < 0)
+    if share < 0:  # the features are those that the head was measured with
+        shown = work.held_out.look("again", layout.grid(left.density, left.features), runner(left.head), 4)
+        assert shown.psnr == tuning.kept.psnr
     assert (tuning.kept.name == "k") == (share < 0)
     assert ("none" in tuning.left_out["head bits"]) == (share < 0)
 

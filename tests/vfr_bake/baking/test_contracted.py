@@ -129,6 +129,15 @@ def test_many_views_take_no_more_rays_than_there_is_time_for(
     assert rays_of_contracted_views(many, 64) == pytest.approx(few / 2)
 
 
+def test_a_camera_near_the_middle_does_not_take_the_rays_of_the_others(model: Model) -> None:
+    few = rays_of_contracted_views(model, 64)
+    for offset in (0.0, 0.01, 0.3):
+        c2w = model.cameras[0].c2w.copy()
+        c2w[:3, 3] = (model.world_from_model @ [offset, 0, 0, 1])[:3]
+        inside = replace(model, cameras=[replace(model.cameras[0], c2w=c2w), *model.cameras[1:]])
+        assert rays_of_contracted_views(inside, 64) > 0.5 * few
+
+
 def depth_at_the_mean_angle(model: Model, asset: Asset, camera: Camera) -> np.ndarray:
     """Return the model's depth [n] as the player defines it: t where the angle is the mean over the weights
     (`player.march.contracted`). In fog it is nearer than the mean t."""

@@ -67,7 +67,8 @@ class WitnessLoss:
         views = witnesses.views()
         self.is_whole = is_whole = np.isin(views, witnesses.whole)
         """[n_witnesses] bool: true for witnesses of whole views."""
-        if len(witnesses.whole) == 1:
+        n_whole = len(np.unique(views[is_whole]))  # a view that is masked as a whole has no witness
+        if n_whole == 1:
             run = np.arange(int(is_whole.sum())) * BLOCKS_OF_A_VIEW // max(int(is_whole.sum()), 1)
             views[is_whole] = len(witnesses.counts) + run
         _, self._block = np.unique(views, return_inverse=True)
@@ -76,8 +77,7 @@ class WitnessLoss:
         """Numbers of the blocks of each kind of witness that there is: of the patches, one block for each
         view, and of the whole views."""
         self._weights = (PATCH_WEIGHT, 1 - PATCH_WEIGHT) if len(self._kinds) == 2 else (1.0,)
-        several = len(witnesses.whole) > 1
-        self._by_view = [several and blocks is self._kinds[-1] for blocks in self._kinds]
+        self._by_view = [n_whole > 1 and blocks is self._kinds[-1] for blocks in self._kinds]
         """For each kind of witness, whether its blocks are whole views, so that the loss is the mean of the
         views' own losses."""
         self._n = np.bincount(self._block, minlength=self._n_blocks)

@@ -148,6 +148,8 @@ def test_whole_photographs_are_compared_where_there_are_some(model: Model) -> No
     none = replace(model, witnesses=None)
     between = compared_views(none, 3)
     assert len(between) == 3 and all(view.photograph is None for view in between)
+    masked = replace(model.witnesses, whole=np.array([len(model.witnesses.counts)], np.int32))
+    assert all(view.photograph is None for view in compared_views(replace(model, witnesses=masked), 3))
     wide = replace(none, cameras=[camera.resized(1600, 1200) for camera in model.cameras])
     assert {(view.camera.width, view.camera.height) for view in compared_views(wide, 2)} == {(640, 480)}
 

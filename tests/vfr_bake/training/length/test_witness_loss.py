@@ -24,10 +24,11 @@ def written_out(witnesses: Witnesses, before: np.ndarray, after: np.ndarray) -> 
     """Return (loss, standard error) by loops over blocks: views, and the parts of a single whole view."""
     blocks: dict[tuple, list[int]] = {}
     views = witnesses.views()
+    n_whole = len({view for view in views if view in witnesses.whole})
     for i, view in enumerate(views):
         if view not in witnesses.whole:
             blocks.setdefault(("patches", view), []).append(i)
-        elif len(witnesses.whole) > 1:
+        elif n_whole > 1:
             blocks.setdefault(("whole", view), []).append(i)
         else:
             place = i - int(np.flatnonzero(views == view)[0])
@@ -42,7 +43,7 @@ def written_out(witnesses: Witnesses, before: np.ndarray, after: np.ndarray) -> 
         of_kind = {}
         for kind in ("patches", "whole"):
             kept = [rows for key, rows in blocks.items() if key[0] == kind and key != left_out]
-            if kind == "whole" and len(witnesses.whole) > 1:
+            if kind == "whole" and n_whole > 1:
                 of_kind[kind] = math.fsum(map(lost, kept)) / len(kept)
             elif kept:
                 of_kind[kind] = lost([i for rows in kept for i in rows])
@@ -65,6 +66,9 @@ def written_out(witnesses: Witnesses, before: np.ndarray, after: np.ndarray) -> 
     [
         ([7, 5, 40, 6, 0, 9], [2]),
         ([7, 30, 6, 33, 9], [1, 3]),
+        ([7, 0, 6, 33, 9], [1, 3]),  # a whole view without witnesses, because it is masked
+        ([7, 0, 6, 33, 20], [1, 3, 4]),
+        ([7, 0, 6, 0, 9], [1, 3]),
         ([5, 6, 7], []),
         ([4], []),
         ([0, 3, 0], [1]),
