@@ -7,17 +7,18 @@ target's name appears.
 
 from __future__ import annotations
 
+import itertools
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from exporters.export_mesh import bounds_of, export_mesh, mesh_paths, world_mesh
+from exporters.export_mesh import NEARER, bounds_of, check_packages, export_mesh, mesh_paths, world_mesh
 from exporters.formats import npz, points, vdb
 from exporters.formats.axes import coordinates_from_world
 from exporters.formats.colmap import COLMAP_FILES, colmap_files
-from exporters.formats.parity import check_points_bytes, check_volume_bytes
+from exporters.formats.parity import check_points_bytes, check_steps, check_volume_bytes
 from exporters.formats.transforms import moved_cameras, transforms_bytes
 from exporters.head.asset_head import head_bytes
 from exporters.options import FOLDERS, MESHES, POINTS, ExportOptions, check_options
@@ -69,7 +70,8 @@ def export_asset(
     Raises:
         ConfigError: an unknown suffix, a setting that does nothing or is out of range, an empty crop, an
             asset that takes more memory than it may, a page that takes more graphics memory or has more
-            channels than browsers can draw, or two files with the same name.
+            channels than browsers can draw, two files with the same name, or a mesh or points so far from
+            the origin that float32 would deform them.
         OutputError: the target exists and `force` is not set, or cannot be written.
         FormatError: the asset, its mesh or a file of cameras is damaged.
         ParityError: what was written does not hold what was to be written.
@@ -79,12 +81,15 @@ def export_asset(
     report = report or silent
     name = check_options(target, options)
     is_mesh = name in MESHES and options.points is None
-    for paths in mesh_paths(target, options, name) if is_mesh else []:
-        for path in paths:
+    if is_mesh:
+        for path in itertools.chain.from_iterable(mesh_paths(target, options, name)):
             _check_target(asset_path, path, name, options.force)
+        check_packages(options, name)
     force = _check_target(asset_path, target, name, options.force)
     asset = Asset.open(asset_path, verify=True, max_memory=options.max_memory)
-    if name not in ("exr", "json", "onnx", "html", "web"):
+    # The mesh that the asset stores needs no densities, and bringing them to one level may take much memory.
+    is_stored = options.method == "baked" and options.texture is None
+    if name not in ("exr", "json", "onnx", "html", "web") and not is_stored:
         asset = inner_region(asset, options.max_memory)
     matrix = coordinates_from_world(options.coordinates, asset.world_from_model, name)
     if is_mesh:
@@ -134,7 +139,10 @@ def _volume(
 def _points(
     asset: Asset, target: Path, options: ExportOptions, matrix: np.ndarray, report: Report
 ) -> tuple[bytes, Facts]:
-    cloud, facts = _cloud(asset, options, report)
+    surface = AssetSurface(asset, report)
+    mesh, facts = world_mesh(surface, options)
+    check_steps(mesh.transformed(matrix), str(target), NEARER)
+    cloud, facts = _cloud(surface, mesh, facts, options)
     moved = cloud.transformed(matrix)
     data = points.points_bytes(moved)
     check_points_bytes(data, moved, str(target))
@@ -155,7 +163,9 @@ def _head(asset: Asset, target: Path, options: ExportOptions) -> tuple[bytes, Fa
 def _export_colmap(
     asset: Asset, target: Path, options: ExportOptions, matrix: np.ndarray, force: bool, report: Report
 ) -> Facts:
-    cloud, facts = _cloud(asset, options, report)
+    surface = AssetSurface(asset, report)
+    mesh, facts = world_mesh(surface, options)
+    cloud, facts = _cloud(surface, mesh, facts, options)
     cameras = moved_cameras(asset_cameras(asset), matrix)
     files = colmap_files(cameras, cloud.transformed(matrix))
     with new_folder(target, force) as folder:
@@ -164,10 +174,10 @@ def _export_colmap(
     return {"cameras": len(cameras), **facts, "bytes": sum(map(len, files.values()))}
 
 
-def _cloud(asset: Asset, options: ExportOptions, report: Report) -> tuple[TriangleMesh, Facts]:
-    """Return points on the surface in the world's coordinates, and facts about them for the summary."""
-    surface = AssetSurface(asset, report)
-    mesh, facts = world_mesh(surface, options)
+def _cloud(
+    surface: AssetSurface, mesh: TriangleMesh, facts: Facts, options: ExportOptions
+) -> tuple[TriangleMesh, Facts]:
+    """Return points on the mesh that `world_mesh` returned, and the facts about it with those about them."""
     cloud = points.sample_points(
         surface.painted(mesh) if "method" in facts else mesh, options.points or POINTS
     )

@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 
 from exporters.formats import glb, obj, ply, stl, usd
-from exporters.formats.parity import check_mesh_bytes, check_textured_obj
+from exporters.formats.parity import check_mesh_bytes, check_steps, check_textured_obj
 from exporters.mesh.paint import paint
 from exporters.mesh.simplify import simplify_mesh
-from exporters.mesh.unwrap import unwrap
+from exporters.mesh.unwrap import require_xatlas, unwrap
 from exporters.options import TEXTURE_FACES, ExportOptions
 from exporters.shapes.crop import crop_mesh, parse_crop
 from exporters.shapes.mesh import TriangleMesh
@@ -31,12 +31,15 @@ from player.progress import Report
 
 _SECONDS = 300.0
 """Seconds that the layout of a texture may take unless another limit is asked for."""
+NEARER = "add --frame model, whose coordinates are small"
+"""The hint for a mesh that is too far from the origin."""
 
 
 def mesh_paths(target: Path, options: ExportOptions, name: str) -> list[list[Path]]:
     """Return the files of each level of detail, the finest level first; a level's first file is the mesh.
 
-    Raises ConfigError: two files would have the same name, because the target's suffix is not its format's.
+    Raises ConfigError: two files would have the same name, because the target's suffix is not its format's,
+    or the name has spaces, which an MTL file cannot quote.
 
     >>> [[path.name for path in level] for level in mesh_paths(Path("a.glb"), ExportOptions(lods=3), "glb")]
     [['a.glb'], ['a.lod1.glb'], ['a.lod2.glb']]
@@ -48,6 +51,7 @@ def mesh_paths(target: Path, options: ExportOptions, name: str) -> list[list[Pat
         levels.append(target.with_name(f"{target.stem}.lod{number}{target.suffix}"))
     if options.texture is None or name != "obj":
         return [[path] for path in levels]
+    obj.check_stem(target.stem)
     found = [[path, path.with_suffix(".mtl"), path.with_suffix(".png")] for path in levels]
     if len({str(path).lower() for paths in found for path in paths}) < 3 * len(found):
         raise ConfigError(
@@ -55,6 +59,15 @@ def mesh_paths(target: Path, options: ExportOptions, name: str) -> list[list[Pat
             f"{target.name}: end it in .obj"
         )
     return found
+
+
+def check_packages(options: ExportOptions, name: str) -> None:
+    """Raise MissingExtraError if a package that only the last steps of an export need is not installed, so
+    that nobody waits for these in vain. `name` is one of `exporters.options.MESHES`."""
+    if options.texture is not None:
+        require_xatlas()
+    if name in ("usdc", "usda"):
+        usd.load_usd()
 
 
 def export_mesh(
@@ -69,6 +82,8 @@ def export_mesh(
         name: one of `exporters.options.MESHES`.
         matrix: [4, 4] transform from the world to the coordinates of the file.
         report: called with (stage, done, of).
+
+    Raises ConfigError: the mesh is so far from the origin that float32 would deform it.
     """
     is_few = options.method is None and options.level is None and options.texture is None
     surface = AssetSurface(asset, report, FEW_PIXELS if is_few else SMALL_PIXELS)
@@ -77,6 +92,8 @@ def export_mesh(
     if n_faces is not None:
         finest = _simplified(finest, n_faces, report)
         facts["faces_asked"] = n_faces
+    if name != "obj":  # the format that has more digits than float32
+        check_steps(finest.transformed(matrix), str(target), NEARER)
     is_white = "method" in facts and options.texture is None and name != "stl"
     written: dict[Path, bytes] = {}
     levels = []
@@ -106,11 +123,15 @@ def world_mesh(surface: AssetSurface, options: ExportOptions) -> tuple[TriangleM
     it is then white, and the facts include the `method`. By default it has about the faces of a
     grid of `exporters.surface.few_faces.RESOLUTION` voxels along the box; with a method or a level
     it keeps all of its faces.
+
+    Raises ConfigError: the stored mesh, which is in float32, is too far from the origin.
     """
     box = None if options.crop is None else parse_crop(options.crop)
     facts: dict[str, Any] = {"frame": options.coordinates}
     if options.method == "baked":
-        mesh = ply.parse_ply(surface.asset.read("mesh.ply"), str(surface.asset.path("mesh.ply")))
+        where = str(surface.asset.path("mesh.ply"))
+        mesh = ply.parse_ply(surface.asset.read("mesh.ply"), where)
+        check_steps(mesh, where, "make the surface again, without --method baked")
     else:
         if options.method == "tsdf":
             mesh, removed = surface.from_depth()
@@ -151,7 +172,8 @@ def _files(
         seconds = options.time_limit or _SECONDS
         layout = partial(surface.report, "layout, seconds of the limit")
         mesh, uvs = unwrap(mesh, options.texture, seconds, layout)
-        texture = paint(mesh, uvs, options.texture, surface.shaded)
+        colours = partial(surface.report, "colours")
+        texture = paint(mesh, uvs, options.texture, surface.shaded, colours)
     mesh = mesh.transformed(matrix)
     if texture is not None and name == "obj":
         files = obj.textured_obj_files(mesh, texture, paths[0].stem)

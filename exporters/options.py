@@ -29,7 +29,7 @@ FORMATS = {
 
 FOLDERS = {
     "exr": "pictures of many layers (colour, depth, position, normals, features), one OpenEXR a camera",
-    "colmap": "COLMAP text: the training cameras and a point cloud",
+    "colmap": "COLMAP model: the training cameras and a point cloud",
     "web": "the page as files for a web server, which shows something before all of it is there",
 }
 """Descriptions of the formats that are folders, by the name that --format takes."""
@@ -39,6 +39,10 @@ MESHES = ("ply", "obj", "glb", "stl", "usdc", "usda")
 
 POINTS = 100_000
 """Points of a COLMAP model, unless another number is asked for."""
+
+MAX_TEXTURE = 8192
+"""The most texels along each side of a texture: Pillow, with which the written picture is read back, refuses
+one of twice as many."""
 
 TEXTURE_FACES = 200_000
 """Faces of a mesh with a texture, unless another number is asked for: laying out more takes minutes."""
@@ -164,7 +168,7 @@ def _check_ranges(options: ExportOptions) -> None:
         ("faces", 1, None),
         ("points", 1, None),
         ("lods", 2, 10),
-        ("texture", 16, 16384),
+        ("texture", 16, MAX_TEXTURE),
         ("max_gpu_mb", 1, None),
     ):
         value = getattr(options, key)

@@ -1,5 +1,8 @@
-"""Writer of a COLMAP model as text (`cameras.txt`, `images.txt`, `points3D.txt`), for Gaussian splatting and
-multi-view stereo.
+"""Writer of a COLMAP model, for Gaussian splatting and multi-view stereo.
+
+The files are text (`cameras.txt`, `images.txt`, `points3D.txt`). If the name of a picture has white space,
+they are binary (`cameras.bin`, `images.bin`, `points3D.bin`) with the same content: readers of the text end a
+name at its first space, while in binary form a name ends with a zero byte.
 
 A COLMAP camera looks along +z with y down (OpenCV). A picture's pose is the transform camera from world, as a
 quaternion (w, x, y, z) and a translation. Pixel centres are at +0.5, as in this project. Pictures have no
@@ -9,8 +12,10 @@ their ERROR is 0.
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -20,10 +25,43 @@ from player.cameras.camera import Camera
 from player.cameras.rotations import OPENGL_FROM_OPENCV, quaternion, rotation_matrix
 from player.errors import ParityError
 
-COLMAP_FILES = ("cameras.txt", "images.txt", "points3D.txt")
-"""The names of a model's files."""
+TEXT_FILES = ("cameras.txt", "images.txt", "points3D.txt")
+BINARY_FILES = ("cameras.bin", "images.bin", "points3D.bin")
+COLMAP_FILES = TEXT_FILES + BINARY_FILES
+"""The names that the files of a model may have."""
 TOLERANCE = 1e-9
 """Largest relative difference of a camera read back: poses go through a quaternion and back, in float64."""
+
+# The binary files are little-endian; each begins with the number of its entries.
+_COUNT = struct.Struct("<Q")
+_LENS = np.dtype([("id", "<u4"), ("model", "<i4"), ("size", "<u8", 2), ("parameters", "<f8", 4)])
+_PINHOLE = 1  # COLMAP's number of the camera model PINHOLE
+_IMAGE = struct.Struct("<I7dI")  # number, pose and lens; then the name, a zero byte and a count of keypoints
+_POINT = np.dtype(
+    [("id", "<u8"), ("place", "<f8", 3), ("colour", "u1", 3), ("error", "<f8"), ("track_length", "<u8")]
+)
+
+
+class _Image(NamedTuple):
+    """A picture of a model."""
+
+    pose: list[float]
+    """Quaternion (w, x, y, z) and translation of the transform camera from world."""
+    lens: int
+    """The number of its COLMAP camera."""
+    name: str
+
+
+class _Model(NamedTuple):
+    """What the three files of a model hold."""
+
+    lenses: dict[int, tuple[float, ...]]
+    """Width, height, fx, fy, cx, cy of each COLMAP camera, by its number."""
+    images: list[_Image]
+    places: np.ndarray
+    """[n_points, 3] float64."""
+    colours: np.ndarray
+    """[n_points, 3] sRGB, 0 to 255."""
 
 
 def colmap_files(cameras: Sequence[Camera], cloud: TriangleMesh) -> dict[str, bytes]:
@@ -36,37 +74,36 @@ def colmap_files(cameras: Sequence[Camera], cloud: TriangleMesh) -> dict[str, by
         cloud: points in the same frame; its normals and faces are not used.
 
     Raises:
-        ParityError: the text does not hold the cameras or the points.
+        ParityError: the files do not hold the cameras or the points.
 
     >>> none = np.zeros((0, 3))
     >>> empty = TriangleMesh(none, np.zeros((0, 3), np.int32), none, np.zeros((0, 4), np.uint8))
     >>> camera = Camera("./a.png", np.eye(4), 4, 3, 5.0, 5.0, 2.0, 1.5)
     >>> colmap_files([camera], empty)["images.txt"].decode().splitlines()[-2]
     '1 0.0 1.0 0.0 0.0 0.0 0.0 0.0 1 a.png'
+    >>> list(colmap_files([replace(camera, name="IMG 0001.jpg")], empty))
+    ['cameras.bin', 'images.bin', 'points3D.bin']
     """
+    model = _model(cameras, cloud)
+    if any(character.isspace() for image in model.images for character in image.name):
+        files = _binary_files(model)
+        _check(_parse_binary(files), cameras, cloud, BINARY_FILES)
+    else:
+        files = _text_files(model)
+        _check(_parse_text(files), cameras, cloud, TEXT_FILES)
+    return files
+
+
+def _model(cameras: Sequence[Camera], cloud: TriangleMesh) -> _Model:
     lenses: dict[tuple[float, ...], int] = {}
-    images = ["# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME, then a line of keypoints (none)"]
-    for number, camera in enumerate(cameras, start=1):
+    images = []
+    for camera in cameras:
         lens = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
         lens_id = lenses.setdefault(lens, len(lenses) + 1)
         w2c = np.linalg.inv(_rigid(camera).c2w @ OPENGL_FROM_OPENCV)
-        pose = _numbers([*quaternion(w2c[:3, :3]), *w2c[:3, 3]])
-        images += [f"{number} {pose} {lens_id} {_name(camera)}", ""]
-    heads = ["# CAMERA_ID, MODEL, WIDTH, HEIGHT, fx, fy, cx, cy"]
-    heads += [f"{i} PINHOLE {lens[0]} {lens[1]} {_numbers(lens[2:])}" for lens, i in lenses.items()]
-    points = ["# POINT3D_ID, X, Y, Z, R, G, B, ERROR, then its track (none)"]
-    points += [
-        f"{number} {_numbers(place)} {red} {green} {blue} 0"
-        for number, (place, (red, green, blue)) in enumerate(
-            zip(cloud.vertices.tolist(), cloud.colours[:, :3].tolist(), strict=True), start=1
-        )
-    ]
-    files = {
-        name: ("\n".join(lines) + "\n").encode()
-        for name, lines in zip(COLMAP_FILES, (heads, images, points), strict=True)
-    }
-    _check(files, cameras, cloud)
-    return files
+        images.append(_Image([*quaternion(w2c[:3, :3]), *w2c[:3, 3]], lens_id, _name(camera)))
+    by_number = {number: lens for lens, number in lenses.items()}
+    return _Model(by_number, images, cloud.vertices.astype(np.float64), cloud.colours[:, :3])
 
 
 def _rigid(camera: Camera) -> Camera:
@@ -81,28 +118,98 @@ def _name(camera: Camera) -> str:
     return camera.name.replace("\\", "/").removeprefix("./")
 
 
+def _text_files(model: _Model) -> dict[str, bytes]:
+    lenses = ["# CAMERA_ID, MODEL, WIDTH, HEIGHT, fx, fy, cx, cy"]
+    lenses += [f"{i} PINHOLE {lens[0]} {lens[1]} {_numbers(lens[2:])}" for i, lens in model.lenses.items()]
+    images = ["# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME, then a line of keypoints (none)"]
+    for number, image in enumerate(model.images, start=1):
+        images += [f"{number} {_numbers(image.pose)} {image.lens} {image.name}", ""]
+    points = ["# POINT3D_ID, X, Y, Z, R, G, B, ERROR, then its track (none)"]
+    points += [
+        f"{number} {_numbers(place)} {red} {green} {blue} 0"
+        for number, (place, (red, green, blue)) in enumerate(
+            zip(model.places.tolist(), model.colours.tolist(), strict=True), start=1
+        )
+    ]
+    return {
+        name: ("\n".join(lines) + "\n").encode()
+        for name, lines in zip(TEXT_FILES, (lenses, images, points), strict=True)
+    }
+
+
 def _numbers(values: Sequence[float]) -> str:
     return " ".join(repr(float(value) + 0.0) for value in values)
 
 
-def _check(files: dict[str, bytes], cameras: Sequence[Camera], cloud: TriangleMesh) -> None:
-    """Parse the text again; raise ParityError unless it holds the cameras and the points."""
-    heads, images, points = (
-        [line for line in files[name].decode().split("\n")[1:-1] if line] for name in COLMAP_FILES
+def _parse_text(files: dict[str, bytes]) -> _Model:
+    heads, pictures, points = (
+        [line for line in files[name].decode().split("\n")[1:-1] if line] for name in TEXT_FILES
     )
-    lenses = {int(words[0]): words for words in map(str.split, heads)}
-    read = []
-    for line in images:
+    lenses: dict[int, tuple[float, ...]] = {}
+    for line in heads:
+        number, _, width, height, *parameters = line.split()
+        lenses[int(number)] = (int(width), int(height), *map(float, parameters))
+    images = []
+    for line in pictures:
         words = line.split(" ", 9)
-        w2c = np.eye(4)
-        w2c[:3, :3] = rotation_matrix(np.array(words[1:5], np.float64))
-        w2c[:3, 3] = np.array(words[5:8], np.float64)
-        lens = lenses[int(words[8])]
-        c2w = np.linalg.inv(w2c) @ OPENGL_FROM_OPENCV
-        fx, fy, cx, cy = map(float, lens[4:])
-        read.append(Camera(words[9], c2w, int(lens[2]), int(lens[3]), fx, fy, cx, cy))
-    check_cameras([_rigid(camera) for camera in cameras], read, "images.txt", TOLERANCE)
+        images.append(_Image([float(word) for word in words[1:8]], int(words[8]), words[9]))
     rows = np.array([line.split() for line in points], np.float64).reshape(-1, 8)
-    expected = np.concatenate([cloud.vertices.astype(np.float64), cloud.colours[:, :3]], axis=1)
-    if rows.shape[0] != len(expected) or not np.array_equal(rows[:, 1:7], expected):
-        raise ParityError(f"points3D.txt: expected {len(expected)} points as sampled, got {len(rows)} others")
+    return _Model(lenses, images, rows[:, 1:4], rows[:, 4:7])
+
+
+def _binary_files(model: _Model) -> dict[str, bytes]:
+    lenses = np.zeros(len(model.lenses), _LENS)
+    numbers = np.array(list(model.lenses.values()), np.float64)
+    lenses["id"], lenses["model"] = list(model.lenses), _PINHOLE
+    lenses["size"], lenses["parameters"] = numbers[:, :2], numbers[:, 2:]
+    images = [
+        _IMAGE.pack(number, *image.pose, image.lens) + image.name.encode() + b"\0" + _COUNT.pack(0)
+        for number, image in enumerate(model.images, start=1)
+    ]
+    points = np.zeros(len(model.places), _POINT)
+    points["id"] = np.arange(1, len(points) + 1)
+    points["place"], points["colour"] = model.places, model.colours
+    cameras_file, images_file, points_file = BINARY_FILES
+    return {
+        cameras_file: _COUNT.pack(len(lenses)) + lenses.tobytes(),
+        images_file: _COUNT.pack(len(images)) + b"".join(images),
+        points_file: _COUNT.pack(len(points)) + points.tobytes(),
+    }
+
+
+def _parse_binary(files: dict[str, bytes]) -> _Model:
+    lens_data, image_data, point_data = (files[name] for name in BINARY_FILES)
+    n_lenses, n_images, n_points = (
+        _COUNT.unpack_from(data)[0] for data in (lens_data, image_data, point_data)
+    )
+    lenses = {
+        int(lens["id"]): (*lens["size"].tolist(), *lens["parameters"].tolist())
+        for lens in np.frombuffer(lens_data, _LENS, n_lenses, _COUNT.size)
+    }
+    images, at = [], _COUNT.size
+    for _ in range(n_images):
+        _, *pose, lens = _IMAGE.unpack_from(image_data, at)
+        at += _IMAGE.size
+        end = image_data.index(b"\0", at)
+        images.append(_Image(pose, lens, image_data[at:end].decode()))
+        at = end + 1 + _COUNT.size
+    points = np.frombuffer(point_data, _POINT, n_points, _COUNT.size)
+    return _Model(lenses, images, points["place"], points["colour"])
+
+
+def _check(read: _Model, cameras: Sequence[Camera], cloud: TriangleMesh, names: Sequence[str]) -> None:
+    """Raise ParityError unless the model that was read back holds the cameras and the points; `names` are
+    those of the three files."""
+    found = []
+    for image in read.images:
+        w2c = np.eye(4)
+        w2c[:3, :3] = rotation_matrix(np.array(image.pose[:4]))
+        w2c[:3, 3] = image.pose[4:]
+        width, height, *lens = read.lenses[image.lens]
+        c2w = np.linalg.inv(w2c) @ OPENGL_FROM_OPENCV
+        found.append(Camera(image.name, c2w, int(width), int(height), *lens))
+    check_cameras([_rigid(camera) for camera in cameras], found, names[1], TOLERANCE)
+    expected = (cloud.vertices, cloud.colours[:, :3])
+    if not all(map(np.array_equal, expected, (read.places, read.colours))):
+        n_expected, n_read = len(cloud.vertices), len(read.places)
+        raise ParityError(f"{names[2]}: expected {n_expected} points as sampled, got {n_read} others")

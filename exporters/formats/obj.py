@@ -54,10 +54,7 @@ def textured_obj_files(mesh: TriangleMesh, texture: Texture, stem: str) -> dict[
     >>> files[".obj"].decode().splitlines()[-1], "map_Kd one.png" in files[".mtl"].decode()
     ('f 1/1/1 2/2/2 3/3/3', True)
     """
-    if not stem or any(character.isspace() for character in stem):
-        raise ConfigError(
-            f"OBJ: name: expected one without spaces, which MTL files cannot name, got {stem!r}"
-        )
+    check_stem(stem)
     flipped = np.stack([texture.uvs[:, 0], 1 - texture.uvs[:, 1].astype(np.float64)], axis=-1)
     obj = b"".join(
         [
@@ -71,6 +68,15 @@ def textured_obj_files(mesh: TriangleMesh, texture: Texture, stem: str) -> dict[
     )
     mtl = f"newmtl surface\nillum 0\nKa 1 1 1\nKd 1 1 1\nKs 0 0 0\nmap_Kd {stem}.png\n".encode()
     return {".png": texture.png(), ".mtl": mtl, ".obj": obj}
+
+
+def check_stem(stem: str) -> None:
+    """Raise ConfigError if the files of a mesh with a texture cannot have this stem. It is also called before
+    long work."""
+    if not stem or any(character.isspace() for character in stem):
+        raise ConfigError(
+            f"OBJ: name: expected one without spaces, which MTL files cannot name, got {stem!r}"
+        )
 
 
 def parse_obj(data: bytes, where: str) -> dict[str, np.ndarray]:

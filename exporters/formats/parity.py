@@ -1,5 +1,5 @@
 """Checks that a written file holds what it was written from. Every number is read back from the bytes and
-compared before the file gets its name."""
+compared before the file gets its name. Another check refuses meshes that float32 cannot hold."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from exporters.shapes.colour import linear_from_srgb
 from exporters.shapes.mesh import TriangleMesh
 from exporters.shapes.texture import Texture
 from exporters.shapes.volume import Volume
-from player.errors import ParityError
+from player.errors import ConfigError, ParityError
 
 COLOUR_TOLERANCE = {".ply": 0.0, ".obj": 6e-5, ".glb": 8e-6, ".usdc": 6e-8, ".usda": 6e-8}
 """Largest difference of a colour, by suffix: half a quantization step of four decimals, 16 bits or float32;
@@ -30,6 +30,30 @@ UV_TOLERANCE = {".obj": 1e-7, ".glb": 0.0}
 OBJ; none for GLB's float32."""
 LINEAR_TOLERANCE = 6e-8
 """Largest difference of linear light: half a quantization step in float32."""
+COARSEST = 0.1
+"""Largest step of float32 between two coordinates that is allowed, in median edges of the mesh."""
+
+
+def check_steps(mesh: TriangleMesh, where: str, hint: str) -> None:
+    """Raise ConfigError if the mesh is so far from the origin that float32 would deform it: if the step from
+    its largest coordinate to the next number is over COARSEST of its median edge.
+
+    Args:
+        mesh: in the coordinates of the file.
+        where: the file's name in the error message.
+        hint: what to do about it, the end of the message.
+    """
+    if not len(mesh.faces):
+        return
+    largest = float(np.abs(mesh.vertices).max())
+    step = float(np.spacing(np.float32(largest)))
+    edges = mesh.vertices[mesh.faces[:, 1]] - mesh.vertices[mesh.faces[:, 0]]  # one of each face
+    edge = float(np.median(np.linalg.norm(edges, axis=1)))
+    if step > COARSEST * edge:
+        raise ConfigError(
+            f"{where}: vertices: expected steps of float32 of at most {COARSEST:g} times the median edge, "
+            f"{edge:.3g}, got {step:.3g} at {largest:.8g}, which is too far from the origin: {hint}"
+        )
 
 
 def check_mesh_bytes(
@@ -147,7 +171,8 @@ def _check_picture(where: str, texture: Texture, png: bytes) -> None:
     image = np.asarray(Image.open(io.BytesIO(png)))
     if image.shape != texture.image.shape:
         raise ParityError(f"{where}: picture: expected {texture.image.shape}, got {image.shape}")
-    _check_rows(where, "texels", texture.image.reshape(-1, 3), image.reshape(-1, 3), 0.0)
+    if not np.array_equal(image, texture.image):  # as bytes, because differences in float64 take much memory
+        _check_rows(where, "texels", texture.image.reshape(-1, 3), image.reshape(-1, 3), 0.0)
 
 
 def _content(suffix: str, data: bytes, where: str) -> dict[str, Any]:

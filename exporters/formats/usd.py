@@ -34,7 +34,7 @@ def usd_bytes(mesh: TriangleMesh, suffix: str, up: str) -> bytes:
     """
     if not len(mesh.faces):
         raise ConfigError("USD: mesh: expected at least one face, got none")
-    Usd, UsdGeom, Vt = _pxr()
+    Usd, UsdGeom, Vt = load_usd()
     colours = linear_from_srgb(mesh.colours[:, :3] / 255).astype(np.float32)
     vertices = mesh.vertices.astype(np.float32)
     with tempfile.TemporaryDirectory() as folder:
@@ -67,7 +67,7 @@ def parse_usd(data: bytes, suffix: str, where: str) -> dict[str, Any]:
     """Return the arrays of a file, read by the library: `vertices`, `normals` [n, 3], `colours` [n, 4] linear
     and `faces` [m, 3], and also `up` ("Y" or "Z") and `metres` (per unit). Raises FormatError for a file
     without triangles or of another format."""
-    Usd, UsdGeom, _ = _pxr()
+    Usd, UsdGeom, _ = load_usd()
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"mesh{suffix}"
         path.write_bytes(data)
@@ -93,7 +93,9 @@ def parse_usd(data: bytes, suffix: str, where: str) -> dict[str, Any]:
     return found
 
 
-def _pxr() -> tuple[Any, Any, Any]:
+def load_usd() -> tuple[Any, Any, Any]:
+    """Import Usd, UsdGeom and Vt of the package usd-core, or raise MissingExtraError, which says how to
+    install it. It is also called before long work."""
     with needs("USD", "usd-core"):
         from pxr import Usd, UsdGeom, Vt
     return Usd, UsdGeom, Vt

@@ -8,6 +8,7 @@ nor mipmaps show the gaps between the charts.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -18,11 +19,13 @@ from exporters.shapes.mesh import TriangleMesh
 from exporters.shapes.texture import Texture
 from player.errors import DataError
 from player.files.images import to_8_bit
+from player.progress import Progress, silent
 
-_AT_ONCE = 1 << 22  # candidate texels tested at a time
+_COLOURED = 1 << 20  # texels of the picture that are coloured at a time, so that memory is bounded
+_TESTED = 1 << 22  # candidate texels tested at a time
 
-ColourPoints = Callable[[np.ndarray, np.ndarray], KnownColours]
-"""A function that returns the colours of points [n, 3] with unit normals [n, 3]."""
+ColourPoints = Callable[[np.ndarray, np.ndarray, Progress], KnownColours]
+"""A function that returns the colours of points [n, 3] with unit normals [n, 3], and reports its progress."""
 
 
 class CoveredTexels(NamedTuple):
@@ -36,33 +39,47 @@ class CoveredTexels(NamedTuple):
     """[n, 3] float64, the weights of the face's corners there (barycentric coordinates), of sum 1."""
 
 
-def paint(mesh: TriangleMesh, uvs: np.ndarray, size: int, colours: ColourPoints) -> Texture:
+def paint(
+    mesh: TriangleMesh, uvs: np.ndarray, size: int, colours: ColourPoints, progress: Progress = silent
+) -> Texture:
     """Paint the texture of a mesh that has been laid out.
 
     Args:
         mesh: the mesh that `exporters.mesh.unwrap` returns.
         uvs: [n_vertices, 2], returned with it.
         size: texels along each side.
-        colours: called once, with the points under the centres of all covered texels.
+        colours: called with the points under the centres of the covered texels, for one band of rows of the
+            picture after another.
+        progress: called with (done, of) as `colours` reports its progress.
 
     Raises:
         DataError: no texel is covered, or none has a colour.
         MissingExtraError: scipy is not installed.
     """
-    texels, faces, shares = covered_texels(uvs, mesh.faces, size)
-    if not len(texels):
-        raise DataError(f"--texture: expected a texel under some face at size {size}, got none")
-    rgb, known = colours(*mesh.at(faces, shares))
-    if not known.any():
-        raise DataError(f"--texture: expected colours on the surface, got none at {len(texels)} points")
     image = np.zeros((size, size, 3), np.uint8)
-    image.reshape(-1, 3)[texels[known]] = to_8_bit(rgb[known])
     covered = np.zeros((size, size), bool)
-    covered.reshape(-1)[texels[known]] = True
+    n_rows = max(_COLOURED // size, 1)
+    bands = [range(start, min(start + n_rows, size)) for start in range(0, size, n_rows)]
+    n_texels = 0
+    for number, rows in enumerate(bands):
+        texels, faces, shares = covered_texels(uvs, mesh.faces, size, rows)
+        rgb, known = colours(*mesh.at(faces, shares), partial(_report_band, progress, number, len(bands)))
+        image.reshape(-1, 3)[texels[known]] = to_8_bit(rgb[known])
+        covered.reshape(-1)[texels[known]] = True
+        n_texels += len(texels)
+    if not n_texels:
+        raise DataError(f"--texture: expected a texel under some face at size {size}, got none")
+    if not covered.any():
+        raise DataError(f"--texture: expected colours on the surface, got none at {n_texels} points")
     return Texture(uvs.astype(np.float32), padded(image, covered))
 
 
-def covered_texels(uvs: np.ndarray, faces: np.ndarray, size: int) -> CoveredTexels:
+def _report_band(progress: Progress, number: int, n_bands: int, done: int, of: int) -> None:
+    """Report that `done` of `of` parts of the band with this number are done, as a share of all bands."""
+    progress(number * of + done, n_bands * of)
+
+
+def covered_texels(uvs: np.ndarray, faces: np.ndarray, size: int, rows: range | None = None) -> CoveredTexels:
     """Return the texels that the faces of a mesh cover, ascending, each once, with the first face that
     contains its centre.
 
@@ -70,27 +87,30 @@ def covered_texels(uvs: np.ndarray, faces: np.ndarray, size: int) -> CoveredTexe
         uvs: [n_vertices, 2], 0..1.
         faces: [n_faces, 3] integers.
         size: texels along each side.
+        rows: consecutive rows of the picture whose texels are returned; None is all rows.
 
     >>> square = np.array([[0.0, 0], [1, 0], [0, 1], [1, 1]])
     >>> covered = covered_texels(square, np.array([[0, 1, 2], [1, 3, 2]]), 2)
     >>> covered.texels.tolist(), covered.faces.tolist()
     ([0, 1, 2, 3], [0, 0, 0, 1])
     """
+    rows = range(size) if rows is None else rows
+    first, last = np.array([0, rows.start]), np.array([size, rows.stop]) - 1  # column and row
     corners = np.asarray(uvs, np.float64)[faces] * size - 0.5  # texel centres are at whole numbers
-    low = np.clip(np.ceil(corners.min(axis=1) - 1e-9), 0, size).astype(np.int64)
-    high = np.clip(np.floor(corners.max(axis=1) + 1e-9), -1, size - 1).astype(np.int64)
+    low = np.clip(np.ceil(corners.min(axis=1) - 1e-9), first, last + 1).astype(np.int64)
+    high = np.clip(np.floor(corners.max(axis=1) + 1e-9), first - 1, last).astype(np.int64)
     extent = np.maximum(high - low + 1, 0)
     ends = np.cumsum(extent[:, 0] * extent[:, 1])
     found = [CoveredTexels(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 3)))]
     start = 0
     while start < len(faces):
         base = ends[start - 1] if start else 0
-        stop = max(int(np.searchsorted(ends, base + _AT_ONCE, side="right")), start + 1)
+        stop = max(int(np.searchsorted(ends, base + _TESTED, side="right")), start + 1)
         found.append(_inside(corners, low, extent, np.arange(start, stop), size))
         start = stop
     texels, face, shares = (np.concatenate(column) for column in zip(*found, strict=True))
-    unique, first = np.unique(texels, return_index=True)
-    return CoveredTexels(unique, face[first], shares[first])
+    unique, chosen = np.unique(texels, return_index=True)
+    return CoveredTexels(unique, face[chosen], shares[chosen])
 
 
 def padded(image: np.ndarray, covered: np.ndarray) -> np.ndarray:

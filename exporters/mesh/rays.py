@@ -31,20 +31,26 @@ class Hits(NamedTuple):
 class MeshRays:
     """A mesh prepared for ray casting.
 
+    Embree computes in float32. The mesh and the cameras are therefore moved together until the middle of the
+    mesh is the origin, which keeps the digits of a world far from its origin.
+
     Raises MissingExtraError: Open3D is not installed.
     """
 
     def __init__(self, mesh: TriangleMesh) -> None:
         open3d = require_open3d("the mesh")
         self._tensor = open3d.core.Tensor
+        self._moved_from_world = np.eye(4)
+        self._moved_from_world[:3, 3] = -mesh.bounds.mean(axis=0)
+        vertices = mesh.vertices + self._moved_from_world[:3, 3]
         self._scene = open3d.t.geometry.RaycastingScene()
         self._scene.add_triangles(
-            np.ascontiguousarray(mesh.vertices, np.float32), np.ascontiguousarray(mesh.faces, np.uint32)
+            np.ascontiguousarray(vertices, np.float32), np.ascontiguousarray(mesh.faces, np.uint32)
         )
 
     def seen_by(self, camera: Camera) -> Hits:
         """Return where the rays through the pixel centres of a camera (world frame) hit the mesh."""
-        rays = np.concatenate(camera.rays(), axis=1)
+        rays = np.concatenate(camera.transformed(self._moved_from_world).rays(), axis=1)
         answer = self._scene.cast_rays(self._tensor(np.ascontiguousarray(rays, np.float32)))
         distance = answer["t_hit"].numpy()
         pixels = np.flatnonzero(np.isfinite(distance))

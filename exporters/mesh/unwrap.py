@@ -23,6 +23,9 @@ from player.progress import Progress, silent
 
 GUTTER = 2
 """Texels left free between two charts."""
+EXTENT = 1000.0
+"""Longest side of the mesh's box as xatlas is given it. xatlas leaves faces of up to 1.2e-7 square units out
+of the layout; in a box of this size no face that matters is so small."""
 PART = 1000
 """Largest number of faces in a part of the mesh; parts share no chart."""
 # The charts together have the area of a square whose edge is this share of the picture's edge; xatlas packs
@@ -51,14 +54,14 @@ def unwrap(
         DataError: xatlas fails, or lays out other faces.
         MissingExtraError: xatlas is not installed.
     """
-    if importlib.util.find_spec("xatlas") is None:
-        raise MissingExtraError("--texture: needs xatlas: pip install 'vfr-bake[export]'")
+    require_xatlas()
     with tempfile.TemporaryDirectory(prefix="vfr-unwrap-") as name:
         folder = Path(name)
         low, high = mesh.bounds
+        scale = EXTENT / max(float((high - low).max()), 1e-30)
         np.savez(
             folder / "mesh.npz",
-            vertices=((mesh.vertices - low) / max(float((high - low).max()), 1e-30)).astype(np.float32),
+            vertices=((mesh.vertices - low) * scale).astype(np.float32),
             faces=mesh.faces.astype(np.uint32),
             normals=mesh.normals.astype(np.float32),
             size=size,
@@ -72,6 +75,13 @@ def unwrap(
         mesh.vertices[source], faces.astype(np.int32), mesh.normals[source], mesh.colours[source]
     )
     return cut, np.clip(uvs, 0, 1).astype(np.float32)
+
+
+def require_xatlas() -> None:
+    """Raise MissingExtraError, which says how to install xatlas, if it is missing. It is also called before
+    long work."""
+    if importlib.util.find_spec("xatlas") is None:
+        raise MissingExtraError("--texture: needs xatlas: pip install 'vfr-bake[export]'")
 
 
 def _run(folder: Path, seconds: float, n_faces: int, progress: Progress) -> None:

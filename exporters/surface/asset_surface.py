@@ -30,7 +30,7 @@ from exporters.surface.tsdf import fuse_depth
 from player.asset.asset import Asset
 from player.errors import DataError, MissingExtraError
 from player.files.images import to_8_bit
-from player.progress import Report
+from player.progress import Progress, Report
 
 FLOATER_FRACTION = 1e-4
 """Connected parts with a smaller share of the faces than this are floaters, which are removed."""
@@ -110,22 +110,23 @@ class AssetSurface:
         views = self._played(FULL_PIXELS)
         return self._in_world(fuse_depth(views, self.voxel, partial(self.report, "fusion")))
 
-    def shaded(self, points: np.ndarray, normals: np.ndarray) -> KnownColours:
+    def shaded(self, points: np.ndarray, normals: np.ndarray, progress: Progress) -> KnownColours:
         """Return the colours that the asset's head gives points [n, 3] on the surface with unit normals [n,
-        3] (`exporters.surface.shaded_colours`)."""
-        return surface_colours(self.asset, points, normals, self.views, partial(self.report, "colours"))
+        3] (`exporters.surface.shaded_colours`); `progress` is called with (done, of)."""
+        return surface_colours(self.asset, points, normals, self.views, progress)
 
     def painted(self, mesh: TriangleMesh) -> TriangleMesh:
         """Return a mesh on the surface with the colours that fit the training views best
         (`exporters.surface.fitted_colours`). Where the views see nothing, and everywhere if Open3D is not
         installed, the colours are the head's own."""
+        progress = partial(self.report, "colours")
         try:
             tolerance = FIT_TOLERANCE * self.voxel
-            rgb, known = fit_colours(mesh, self.views, tolerance, partial(self.report, "colours"))
+            rgb, known = fit_colours(mesh, self.views, tolerance, progress)
         except MissingExtraError:
             rgb, known = np.zeros((len(mesh.vertices), 3)), np.zeros(len(mesh.vertices), bool)
         rest = np.flatnonzero(~known)
-        rgb[rest], known[rest] = self.shaded(mesh.vertices[rest], mesh.normals[rest])
+        rgb[rest], known[rest] = self.shaded(mesh.vertices[rest], mesh.normals[rest], progress)
         colours = mesh.colours.copy()
         colours[:, :3] = to_8_bit(rgb)
         return replace(mesh, colours=_from_around(colours, known, mesh.faces))

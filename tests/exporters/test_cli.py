@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -121,6 +122,19 @@ def test_damaged_mesh_leaves_nothing_behind(
     assert ("mesh.ply: sha256: expected" if damage == "changed" else "mesh.ply: size: expected") in error
     assert error.count("\n") == 1
     assert sorted(path.name for path in tmp_path.iterdir()) == ["asset"]
+
+
+def test_a_stored_mesh_that_float32_has_deformed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """An asset's mesh in the coordinates of a map is refused in every frame: it is stored in float32."""
+    far = replace(tetrahedron(), vertices=tetrahedron().vertices + 4.5e6)
+    asset = write_small_asset(tmp_path / "asset", ply_bytes(far))
+    for frame in ("world", "model"):
+        target = tmp_path / "mesh.obj"
+        assert cli.main([str(asset), str(target), "--method", "baked", "--frame", frame]) == 1
+        error = capsys.readouterr().err
+        assert "mesh.ply: vertices: expected steps of float32 of at most 0.1 times the median edge" in error
+        assert error.endswith("make the surface again, without --method baked\n")
+        assert not target.exists()
 
 
 def test_an_empty_folder_is_no_asset(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

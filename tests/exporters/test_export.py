@@ -61,6 +61,22 @@ def test_crop_is_in_world_units_in_every_frame(shells_asset: Path, tmp_path: Pat
         assert summary["faces"] == 2 and summary["bounds"][1][0] == 1.25
 
 
+@pytest.mark.parametrize("arguments", ["a.glb", "a.ply --points 9", "d --format colmap --points 9"])
+def test_the_stored_mesh_needs_no_density(
+    arguments: str, shells_asset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With --method baked the densities are not brought to one level, which may take much memory."""
+
+    def refuse(*_: object) -> None:
+        raise AssertionError("the densities are brought to one level")
+
+    monkeypatch.setattr(export, "inner_region", refuse)
+    name, *more = shlex.split(arguments)
+    assert cli.main([str(shells_asset), str(tmp_path / name), *more, "--method", "baked"]) == 0
+    with pytest.raises(AssertionError, match="one level"):
+        cli.main([str(shells_asset), str(tmp_path / name), *more, "--force"])
+
+
 def test_format_overrules_the_suffix(shells_asset: Path, tmp_path: Path) -> None:
     target = tmp_path / "mesh.bin"
     assert cli.main([str(shells_asset), str(target), "--format", "stl", "--method", "baked"]) == 0

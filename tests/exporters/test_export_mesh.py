@@ -2,21 +2,26 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import os
+import re
 import shlex
+import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
 
-from exporters import cli
+from exporters import cli, export, export_mesh
 from exporters.formats.ply import read_ply
 from player.asset.asset import Asset
 from player.errors import OutputError
 from player.files.files import write_together
 from tests.exporters.conftest import CUBE_HIGH, CUBE_LOW
+from tests.exporters.meshes import sphere
 from tests.exporters.solids import WORLD_FROM_MODEL, offset_of
 from tests.exporters.test_export import fails
 
@@ -50,7 +55,9 @@ def test_what_was_removed_is_said(
     assert "faces that no training camera sees, 0 of haze and 0 floating parts (0 faces) removed" in out
     assert cli.main([*arguments, "--force", "--json"]) == 0
     summary = json.loads(capsys.readouterr().out)
-    assert summary["method"] == "density" and summary["unseen_faces_removed"] >= 0
+    told = re.search(r"(\d+) faces that no training camera sees, (\d+) of haze", out)
+    assert told and summary["method"] == "density"
+    assert [summary["unseen_faces_removed"], summary["haze_faces_removed"]] == [int(n) for n in told.groups()]
     assert summary["floaters_removed"] == summary["floater_faces_removed"] == 0
 
 
@@ -107,7 +114,8 @@ def test_a_texture_has_the_vertex_colours_of_the_surface(
         ("a.ply --level 5 --method baked", "--level: expected --method density, got baked"),
         ("a.ply --level 20 --crop 90,9,9,1,1,1", "--crop: expected a box with some of the mesh in it"),
         ("a.ply --lods 1", "--lods: expected 2 to 10, got 1"),
-        ("a.glb --texture 8", "--texture: expected 16 to 16384, got 8"),
+        ("a.glb --texture 8", "--texture: expected 16 to 8192, got 8"),
+        ("a.glb --texture 8193", "--texture: expected 16 to 8192, got 8193"),
         ("a.ply --texture 64", "--texture does nothing for a ply mesh; it takes --crop, --faces, --frame"),
         ("a.glb --time-limit 5", "--time-limit: expected it with --texture, got it alone"),
         ("a.glb --texture 64 --time-limit 0", "--time-limit: expected seconds > 0, got 0"),
@@ -125,6 +133,47 @@ def test_one_line_and_nothing_written(
     words = [word for part in more for word in shlex.split(f"--{part}")]
     assert message in fails([str(cube_asset.folder), str(tmp_path / name), *words], capsys)
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("'a b.obj' --texture 64", "OBJ: name: expected one without spaces"),
+        ("a.glb --texture 64", "--texture: needs xatlas: pip install 'vfr-bake[export]'"),
+        ("a.usdc", "USD: needs usd-core: pip install 'vfr-bake[export]'"),
+    ],
+)
+def test_what_the_last_step_would_refuse_is_refused_before_the_asset_is_opened(
+    arguments: str,
+    message: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setitem(sys.modules, "pxr", None)
+    name, *more = shlex.split(arguments)
+    assert message in fails([str(tmp_path / "no asset"), str(tmp_path / name), *more], capsys)
+
+
+@pytest.mark.parametrize("arguments", ["a.ply", "a.glb", "a.stl", "a.usdc", "a.ply --points 9"])
+def test_coordinates_that_float32_cannot_hold(
+    arguments: str,
+    cube_asset: Asset,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """A mesh in the coordinates of a map is refused in one line; an OBJ has digits enough."""
+    mesh = sphere(20)
+    far = replace(mesh, vertices=mesh.vertices + np.array([4.5e6, 5e5, 300.0]))
+    for module in (export, export_mesh):
+        monkeypatch.setattr(module, "world_mesh", lambda *_: (far, {"frame": "world"}))
+    name, *more = shlex.split(arguments)
+    error = fails([str(cube_asset.folder), str(tmp_path / name), *more], capsys)
+    assert f"{name}: vertices: expected steps of float32" in error and "add --frame model" in error
+    assert not list(tmp_path.iterdir())
+    assert cli.main([str(cube_asset.folder), str(tmp_path / "a.obj")]) == 0
 
 
 def test_files_beside_the_target_are_not_overwritten(

@@ -124,6 +124,9 @@ def test_folder_of_pictures(shells_asset: Path, tmp_path: Path, capsys: pytest.C
     assert capsys.readouterr().out.startswith(f"{target}: 2 pictures, 18 channels, ")
     files = {path.name: path.read_bytes() for path in target.iterdir()}
     assert sorted(files) == ["r_1.exr", "r_2.exr"]
+    with OpenEXR.File(str(target / "r_1.exr"), separate_channels=True) as file:
+        red = file.channels()["R"].pixels
+    assert red.shape == (20, 24) and red.dtype == np.float16
     assert cli.main([*arguments, "--force"]) == 0
     assert {path.name: path.read_bytes() for path in target.iterdir()} == files  # the same bytes again
     assert sorted(path.name for path in tmp_path.iterdir()) == ["frames"]

@@ -14,7 +14,7 @@ import trimesh
 
 from exporters.formats.glb import glb_bytes, parse_glb, y_up
 from exporters.formats.obj import obj_bytes
-from exporters.formats.parity import check_mesh_bytes
+from exporters.formats.parity import check_mesh_bytes, check_steps
 from exporters.formats.ply import parse_ply, ply_bytes, read_ply, small_ply_bytes, small_ply_size
 from exporters.shapes.colour import linear_from_srgb
 from exporters.shapes.mesh import TriangleMesh
@@ -223,6 +223,22 @@ def test_limits() -> None:
     check_mesh_bytes(
         ".obj", obj_bytes(replace(mesh, faces=mesh.faces[:0])), replace(mesh, faces=mesh.faces[:0]), "a.obj"
     )
+
+
+def test_too_far_from_the_origin_for_float32() -> None:
+    """Float32 has steps of 1/64 from 2^17 on and of 1/32 from 2^18 on; the sphere's median edge is 0.157."""
+    mesh = sphere(20)
+    check_steps(mesh, "a.ply", "come nearer")
+    near = replace(mesh, vertices=mesh.vertices + np.array([2.0**17, 0, 0]))
+    check_steps(near, "a.ply", "come nearer")
+    far = replace(mesh, vertices=mesh.vertices - np.array([0, 2.0**18, 0]))
+    message = (
+        r"^a\.ply: vertices: expected steps of float32 of at most 0\.1 times the median edge, 0\.157, "
+        r"got 0\.0312 at 262145, which is too far from the origin: come nearer$"
+    )
+    with pytest.raises(ConfigError, match=message):
+        check_steps(far, "a.ply", "come nearer")
+    check_steps(replace(far, faces=far.faces[:0]), "a.ply", "come nearer")
 
 
 @pytest.mark.parametrize("suffix", WRITERS)

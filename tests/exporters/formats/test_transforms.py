@@ -9,14 +9,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from exporters import cli
+from exporters import cli, export
 from exporters.formats import colmap
 from exporters.formats.axes import COORDINATES, coordinates_from_world
-from exporters.formats.colmap import colmap_files
+from exporters.formats.colmap import BINARY_FILES, TEXT_FILES, colmap_files
 from exporters.formats.points import sample_points
 from exporters.formats.transforms import check_cameras, moved_cameras, transforms_bytes
 from player.asset.asset import Asset
 from player.cameras.camera import Camera
+from player.cameras.colmap import read_images, read_points, read_views
 from player.cameras.rotations import quaternion, rotation_matrix
 from player.cameras.transforms import read_cameras
 from player.errors import ParityError
@@ -56,19 +57,31 @@ def test_in_the_world_they_are_the_asset_s(opened: Asset, shells_asset: Path, tm
         assert before.c2w.tobytes() == after.c2w.tobytes()
 
 
+@pytest.mark.parametrize("first", ["./test/r_0", "./my pictures/IMG 0001.jpg"])
 def test_pycolmap_reads_the_model(
-    opened: Asset, shells_asset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    first: str,
+    opened: Asset,
+    shells_asset: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
-    """pycolmap, an independent program with other camera axes, projects points onto the same pixels."""
+    """pycolmap, an independent program with other camera axes, projects points onto the same pixels, and
+    reads names with spaces."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         import pycolmap
 
+    cameras = trained(opened)
+    cameras[0] = replace(cameras[0], name=first)
+    monkeypatch.setattr(export, "asset_cameras", lambda asset: cameras)
     target = tmp_path / "sparse"
     arguments = [str(shells_asset), f"{target}/", "--format", "colmap", "--points", "50", "--frame", "model"]
     arguments += ["--method", "baked"]
     assert cli.main(arguments) == 0
     assert "5 cameras, 50 points" in capsys.readouterr().out
+    names = BINARY_FILES if " " in first else TEXT_FILES
+    assert sorted(path.name for path in target.iterdir()) == sorted(names)
     model = pycolmap.Reconstruction(str(target))
     assert model.num_images() == 5 and model.num_cameras() == 1 and model.num_points3D() == 50
     world = sample_points(box(*BOX), 50).vertices
@@ -76,7 +89,7 @@ def test_pycolmap_reads_the_model(
     moved = np.c_[world, np.ones(50)] @ np.linalg.inv(opened.world_from_model).T
     np.testing.assert_allclose(places, moved[:, :3], rtol=0, atol=1e-6)
     by_name = {image.name: image for image in model.images.values()}
-    for camera in trained(opened):
+    for camera in cameras:
         image = by_name[camera.name.removeprefix("./")]
         pixels = np.array([image.project_point(place) for place in places])
         np.testing.assert_allclose(pixels, project(camera, world), rtol=0, atol=1e-4)
@@ -94,8 +107,8 @@ def test_quaternions_survive() -> None:
         np.testing.assert_allclose(rotation_matrix(q), turn, rtol=0, atol=1e-12)
 
 
-def test_lenses_are_shared_and_names_may_have_spaces() -> None:
-    camera = Camera("./my pictures/a b.png", np.eye(4), 4, 3, 5.0, 5.5, 2.0, 1.5)
+def test_lenses_are_shared() -> None:
+    camera = Camera("./pictures/a.png", np.eye(4), 4, 3, 5.0, 5.5, 2.0, 1.5)
     other = camera.resized(8, 6)
     files = colmap_files([camera, other, camera], box((0, 0, 0), (1, 1, 1)))
     assert files["cameras.txt"].decode().splitlines()[1:] == [
@@ -104,9 +117,31 @@ def test_lenses_are_shared_and_names_may_have_spaces() -> None:
     ]
     images = files["images.txt"].decode().splitlines()
     assert [line.split(" ", 8)[8] for line in images[1::2]] == [
-        f"{number} my pictures/a b.png" for number in (1, 2, 1)
+        f"{number} pictures/a.png" for number in (1, 2, 1)
     ]
     assert files == colmap_files([camera, other, camera], box((0, 0, 0), (1, 1, 1)))
+
+
+@pytest.mark.parametrize("name", ["a b.png", "my pictures/a.png", "9.41\u202fAM.png"])
+def test_names_with_white_space_make_binary_files(name: str, tmp_path: Path) -> None:
+    """The player's reader finds the names and cameras in the binary files; the numbers of bytes are COLMAP's:
+    56 a camera, 73 and the name a picture, 51 a point."""
+    camera = Camera(f"./{name}", np.eye(4), 4, 3, 5.0, 5.5, 2.0, 1.5)
+    other = replace(camera.resized(8, 6), name="a.png")
+    files = colmap_files([camera, other, camera], box((0, 0, 0), (1, 1, 1)))
+    assert tuple(files) == BINARY_FILES
+    for file, data in files.items():
+        (tmp_path / file).write_bytes(data)
+    assert [(image.name, image.camera_id) for image in read_images(tmp_path / "images.bin")] == [
+        (name, 1), ("a.png", 2), (name, 1)
+    ]  # fmt: skip
+    for read, expected in zip(read_views(tmp_path), sorted([name, name, "a.png"]), strict=True):
+        camera_there = other if expected == "a.png" else camera
+        check_cameras([replace(camera_there, name=expected)], [read], expected, 1e-12)
+    assert np.array_equal(read_points(tmp_path / "points3D.bin"), box((0, 0, 0), (1, 1, 1)).vertices)
+    assert [len(data) for data in files.values()] == [
+        8 + 2 * 56, 8 + 3 * 73 + 2 * len(name.encode()) + len("a.png"), 8 + 8 * 51
+    ]  # fmt: skip
 
 
 def test_parity() -> None:
@@ -121,6 +156,26 @@ def test_parity() -> None:
         check_cameras([camera], [], "t.json", 0.0)
     with pytest.raises(ParityError, match="expected a 4x3, got a 8x6"):
         check_cameras([camera], [camera.resized(8, 6)], "t.json", 0.0)
+
+
+def test_colmap_parity_of_binary_files(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A name or a colour in the binary files that differs from the source is refused."""
+    camera = Camera("a b", np.eye(4), 4, 3, 5.0, 5.0, 2.0, 1.5)
+    corners = box((0, 0, 0), (1, 1, 1))
+    write = colmap._binary_files
+
+    def renamed(model: colmap._Model) -> dict[str, bytes]:
+        return write(model._replace(images=[image._replace(name="a c") for image in model.images]))
+
+    def black(model: colmap._Model) -> dict[str, bytes]:
+        return write(model._replace(colours=np.zeros_like(model.colours)))
+
+    monkeypatch.setattr(colmap, "_binary_files", renamed)
+    with pytest.raises(ParityError, match=r"images\.bin: camera: expected a b 4x3, got a c 4x3"):
+        colmap_files([camera], corners)
+    monkeypatch.setattr(colmap, "_binary_files", black)
+    with pytest.raises(ParityError, match=r"points3D\.bin: expected 8 points as sampled, got 8 others"):
+        colmap_files([camera], corners)
 
 
 def test_colmap_parity(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -7,10 +7,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from exporters.mesh import paint as module
 from exporters.mesh.paint import covered_texels, padded, paint
 from exporters.shapes.colour import KnownColours
 from exporters.shapes.mesh import TriangleMesh
 from player.errors import DataError
+from player.progress import Progress
 
 
 def naive_texels(uvs: np.ndarray, faces: np.ndarray, size: int) -> dict[int, int]:
@@ -39,6 +41,9 @@ def test_texels_are_the_naive_loop(seed: int) -> None:
     assert dict(zip(texels.tolist(), face.tolist(), strict=True)) == naive_texels(uvs, faces, 13)
     centres = np.stack([texels % 13 + 0.5, texels // 13 + 0.5], axis=-1) / 13
     np.testing.assert_allclose(np.einsum("ij,ijk->ik", shares, uvs[faces[face]]), centres, rtol=0, atol=1e-9)
+    bands = [covered_texels(uvs, faces, 13, rows) for rows in (range(5), range(5, 6), range(6, 13))]
+    for whole, parts in zip((texels, face, shares), zip(*bands, strict=True), strict=True):
+        assert np.array_equal(np.concatenate(parts), whole)
 
 
 def test_padding_takes_the_nearest() -> None:
@@ -68,7 +73,7 @@ def test_paint_asks_for_the_places_under_the_centres() -> None:
     mesh, uvs = flat()
     asked = []
 
-    def colours(points: np.ndarray, normals: np.ndarray) -> KnownColours:
+    def colours(points: np.ndarray, normals: np.ndarray, progress: Progress) -> KnownColours:
         asked.append((points, normals))
         return KnownColours(points / 2 * [1, 1, 0], points[:, 0] > 0.5)
 
@@ -83,6 +88,25 @@ def test_paint_asks_for_the_places_under_the_centres() -> None:
     assert texture.image[0, 7].tolist() == [239, 239, 0] and texture.image[7, 7].tolist() == [239, 16, 0]
     assert texture.image[0, 0].tolist() == texture.image[0, 2].tolist()  # unknown there: the nearest colour
     with pytest.raises(DataError, match="expected colours on the surface, got none"):
-        paint(mesh, uvs, 8, lambda points, normals: KnownColours(points, np.zeros(len(points), bool)))
+        paint(mesh, uvs, 8, lambda points, *_: KnownColours(points, np.zeros(len(points), bool)))
     with pytest.raises(DataError, match="expected a texel under some face"):
         paint(mesh, uvs * 0, 8, colours)
+
+
+def test_bands_of_rows_make_the_picture_that_is_made_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Colours are asked for no more texels at a time than is allowed, and progress is that of all bands."""
+    mesh, uvs = flat()
+    asked, counts = [], []
+
+    def colours(points: np.ndarray, normals: np.ndarray, progress: Progress) -> KnownColours:
+        asked.append(len(points))
+        progress(1, 2)
+        progress(2, 2)
+        return KnownColours(points / 2 * [1, 1, 0], points[:, 0] > 0.5)
+
+    whole = paint(mesh, uvs, 8, colours)
+    monkeypatch.setattr(module, "_COLOURED", 24)
+    parts = paint(mesh, uvs, 8, colours, lambda done, of: counts.append((done, of)))
+    assert asked == [64, 24, 24, 16]
+    assert np.array_equal(parts.image, whole.image)
+    assert counts == [(done, 6) for done in range(1, 7)]

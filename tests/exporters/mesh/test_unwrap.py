@@ -11,8 +11,10 @@ import pytest
 from exporters.mesh import unwrap as module
 from exporters.mesh.paint import covered_texels
 from exporters.mesh.unwrap import parts_of, unwrap
+from exporters.shapes.mesh import TriangleMesh
 from player.errors import ConfigError, DataError, MissingExtraError
 from tests.exporters.meshes import sphere
+from tests.exporters.surface.test_depth_views import joined
 
 MESH = sphere(30)
 
@@ -33,6 +35,16 @@ def test_the_faces_stay_and_share_no_texel() -> None:
     assert len(texels) > 0.5 * size * size
     again = unwrap(MESH, 256, 60.0)
     assert again[1].tobytes() == uvs.tobytes() and again[0].faces.tobytes() == cut.faces.tobytes()
+
+
+def test_small_faces_have_a_place() -> None:
+    """A face with edges of 1/2500 of the mesh is laid out, too. All corners of a face that xatlas leaves out
+    are at (0, 0)."""
+    corners = np.array([[1.5, 0, 0], [1.5, 1e-3, 0], [1.5, 0, 1e-3]])
+    normals, white = np.tile([1.0, 0, 0], (3, 1)), np.full((3, 4), 255, np.uint8)
+    small = TriangleMesh(corners, np.array([[0, 1, 2]], np.int32), normals, white)
+    cut, uvs = unwrap(joined(MESH, small), 256, 60.0)
+    assert (uvs[cut.faces] != 0).any(axis=(1, 2)).all()
 
 
 def test_parts_hold_every_face_once() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import tracemalloc
 from dataclasses import replace
 from pathlib import Path
 
@@ -109,6 +110,21 @@ def test_parity_of_textured_files() -> None:
             check_textured_obj(obj, other_mesh, other, "a.obj")
     with pytest.raises(ParityError, match=r"map_Kd: expected a.png, got \['b.png'\]"):
         check_textured_obj(obj | {".mtl": b"map_Kd b.png\n"}, mesh, texture, "a.obj")
+
+
+def test_equal_pictures_are_compared_in_little_memory() -> None:
+    """Comparing a picture takes a few times its bytes; differences in float64 would take over 24 times."""
+    mesh, texture = cornered()
+    large = Texture(texture.uvs, np.zeros((1024, 1024, 3), np.uint8))
+    data = glb_bytes(mesh, large)
+    check_mesh_bytes(".glb", data, mesh, "a.glb", large)  # loads Pillow
+    tracemalloc.start()
+    try:
+        check_mesh_bytes(".glb", data, mesh, "a.glb", large)
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert peak < 8 * large.image.nbytes
 
 
 def test_refusals() -> None:

@@ -47,6 +47,18 @@ def test_the_colours_of_a_ball() -> None:
 
 
 @pytest.mark.needs("open3d")
+def test_far_from_the_origin() -> None:
+    """In the coordinates of a map, which float32 rounds to half a radius, a ball has the same colours."""
+    mesh = sphere(24)
+    shift = np.eye(4)
+    shift[:3, 3] = 4.5e6, -5e5, 300
+    views = [replace(view, camera=view.camera.transformed(shift)) for view in pictures()]
+    near, _ = fit_colours(mesh, pictures(), 0.05)
+    far, known = fit_colours(mesh.transformed(shift), views, 0.05)
+    assert known.all() and np.abs(far - near).max() < 0.01
+
+
+@pytest.mark.needs("open3d")
 def test_no_other_colours_are_nearer_to_the_pictures() -> None:
     """Where pictures contradict each other, colours are their mean; a side that only one sees has its own."""
     mesh = sphere(24)
