@@ -25,7 +25,9 @@ TILE = 256
 MOST_CHANNELS = 40
 """Most channels that a page can draw: eight per draw buffer, with one buffer for the opacity. WebGL2
 guarantees four buffers, graphics cards have eight, and the renderer of Chromium for machines without a card
-has six."""
+has six. Phones and tablets of Apple also limit the bits of a pixel in all buffers together, to 512, or 256
+where they are older. A buffer of eight channels has 128 bits and that of the opacity 64, so that they draw at
+most 24 or 8 channels; there `renderer.js` refuses a page with more."""
 
 
 def gpu_bytes(asset: Asset) -> int:

@@ -19,6 +19,9 @@
 // - n_parts: how many parts have been read; problem: a sentence about a part that could not be read, or null.
 //
 // onProgress({ done, total }) is told the progress in bytes: half of the total is for loading and half for decoding.
+//
+// If the browser or the device cannot decode a scene, the Error that loadScene throws has `isWhole`: true, which says that
+// the data are not to blame.
 
 import { SceneReader, checkedFile } from "./scene_reader.js";
 
@@ -39,7 +42,9 @@ export async function* loadScene(onProgress) {
   const small = async (name) => checkedFile(name, await get(name), manifest.files[name]);
   const cameras = JSON.parse(new TextDecoder().decode(await small("cameras.json")));
   const head = headOf(JSON.parse(new TextDecoder().decode(await small("head.json"))), await small("head.bin"));
-  const readers = await startReaders(manifest);
+  const readers = await startReaders(manifest).catch((error) => {
+    throw Object.assign(error, { isWhole: true });
+  });
   const read = (file) => readers.read(file, (n) => {
     done.decoded += n;
     tell();
@@ -48,7 +53,7 @@ export async function* loadScene(onProgress) {
   // that is asked for; then the next part may be asked for.
   const begin = async (part, isShown) => {
     const file = await get(manifest.parts[part].file);
-    const asked = { read: read(file), grid: isShown ? readers.grid(part + 1 === nParts) : null };
+    const asked = { read: read(file), grid: isShown ? readers.grid() : null };
     for (const promise of [asked.read, asked.grid]) promise?.catch(() => {}); // errors are reported when these are awaited
     return asked;
   };
@@ -71,7 +76,7 @@ export async function* loadScene(onProgress) {
       } catch (error) {
         if (part === 0) throw error;
         const problem = `${error.message}: shown as the first ${part} of ${nParts} parts have it`;
-        scene = { ...scene, ...(readers.areWhole && { grid: await readers.grid(true), n_parts: part }), problem };
+        scene = { ...scene, ...(readers.areWhole && { grid: await readers.grid(), n_parts: part }), problem };
       }
       yield scene;
     }
@@ -145,8 +150,8 @@ class Readers {
     for (const { reason } of done) if (reason) throw reason;
   }
 
-  async grid(isLast) {
-    return Object.assign({}, ...await Promise.all(this.readers.map((reader) => reader.grid(isLast))));
+  async grid() {
+    return Object.assign({}, ...await Promise.all(this.readers.map((reader) => reader.grid())));
   }
 
   close() {
@@ -220,8 +225,8 @@ class WorkerReader {
     return this.ask("read", file);
   }
 
-  grid(isLast) {
-    return this.ask("grid", isLast);
+  grid() {
+    return this.ask("grid");
   }
 
   close() {

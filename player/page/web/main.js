@@ -14,7 +14,7 @@ const ANEW = "What arrived is not whole: load the page again, or ask for it anew
 const RESET = "The graphics card was reset. If the picture does not come back by itself, "
   + "load the page again.";
 
-// Show the scene; resolve to the renderer when all of the scene is there.
+// Show the scene; resolve to the renderer when all of the scene is there, and reject if it cannot all be shown.
 async function show() {
   const options = optionsOf(location.hash), canvas = document.getElementById("canvas");
   const panel = new Panel(options);
@@ -47,6 +47,7 @@ async function show() {
       panel.connect(viewer, new Controls(viewer), scene.cameras);
     }
   } catch (error) {
+    if (error.isWhole) advice = INSTEAD;
     if (viewer) problem = `This scene cannot be shown whole here: ${error.message}. ${advice}`;
     else panel.fail(`This scene cannot be shown here: ${error.message}. ${advice}`);
     throw error;
@@ -56,6 +57,7 @@ async function show() {
     if (!renderer?.lost) panel.say(said);
     viewer?.uncover();
   }
+  if (problem) throw new Error(problem); // the page goes on showing what it has
   return renderer;
 }
 

@@ -10,11 +10,16 @@ export class Panel {
   // Set up what is shown before there is a scene; `options` are those of the page's address.
   constructor(options) {
     document.body.classList.toggle("plain", Boolean(options.noui));
-    document.body.classList.toggle("clear", options.background === "transparent");
+    if (options.background === "transparent") {
+      document.body.classList.add("clear");
+      // Browsers make a frame opaque whose colour scheme is not that of the page around it, which mostly is the light one.
+      document.documentElement.style.colorScheme = "light";
+    }
     element("title").textContent = document.title;
     element("poster").alt = `Preview of ${document.title}`;
     const card = element("card");
     card.addEventListener("click", (event) => event.target === card && card.close()); // beside the card
+    element("close").addEventListener("click", () => card.close());
   }
 
   // Show a line of text below the picture; "" removes it. After `fail`, its text stays.

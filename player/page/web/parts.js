@@ -149,8 +149,10 @@ export class PartsReader {
   // each level, the finest first, `vertices` its Vertices. `values` [n_rows * stride], Uint8Array for densities, Int8Array for
   // features, has a row for each vertex, including those on the border. Rows are sorted by level, then by brick of vertices,
   // then by bit; those of features are padded to a multiple of four numbers. `firstRows` [n_levels + 1]: the first row of each
-  // level, and the number of rows. `isLast`: nothing will be asked for afterwards.
-  values(isLast) {
+  // level, and the number of rows. Once all parts have been read, `values` may be the reader's own array: the caller may give
+  // it away, and asks for nothing afterwards.
+  values() {
+    const isLast = this.nRead === this.manifest.parts.length;
     return Object.fromEntries(Object.entries(this.grids).map(([name, grid]) => [name, grid.values(isLast)]));
   }
 }

@@ -4,13 +4,14 @@
 // "fast", background: [r, g, b] | "transparent", layer: "colour" | "depth" | "normals" | "opacity", jitter: [dx, dy],
 // accumulate, n_fetches }. By default `background` is the manifest's, `quality` is "high" ("exact" for `render`), and
 // `layer` is "colour". `jitter` shifts the rays by fractions of a pixel. With `accumulate` the canvas shows the mean of
-// the pictures drawn since the last one without it. `n_fetches` replaces the quality's feature lookups per ray; 0 looks
-// features up at every sample.
+// the pictures drawn since the last one without it. A picture that cannot be added up, because its layer is not "colour" or
+// the graphics card draws no sums, is drawn without jitter. `n_fetches` replaces the quality's feature lookups per ray; 0
+// looks features up at every sample.
 import { raysOf } from "./camera.js";
 import { NO_GRID } from "./grid.js";
 import { multiplyAdds } from "./head.js";
 import { compositeSource, foundTextures, headSource, marchSource, Program } from "./program.js";
-import { checkMemory, deleteFramebuffer, framebufferOf, gpuBytes, TILE } from "./textures.js";
+import { checkMemory, deleteFramebuffer, framebufferOf, gpuBytes, isComplete, TILE } from "./textures.js";
 import { uploadFloats, uploadGrid, uploadLattice } from "./textures.js";
 
 const OPAQUE_DEPTH = Math.log(1000);
@@ -139,12 +140,18 @@ export class Renderer {
   }
 
   // Make the framebuffers between the passes of a tile: `found` for what the march has found in each pixel, and `colours` for
-  // the head's colours, 2 x 2 pixels per texel.
+  // the head's colours, 2 x 2 pixels per texel. Throws an Error if the graphics card cannot draw to so many buffers at once,
+  // or so many bits of a pixel in all of them.
   makeTile(nChannels) {
     const { gl } = this, n = foundTextures(nChannels), most = gl.getParameter(gl.MAX_DRAW_BUFFERS);
     if (n + 1 > most) throw new Error(`WebGL2: expected ${n + 1} draw buffers for ${nChannels} channels, got ${most}`);
-    this.found = framebufferOf(gl, TILE, TILE, [...Array(n).fill(gl.RGBA32UI), gl.RG32UI]);
-    this.colours = framebufferOf(gl, TILE / 2, TILE / 2, [gl.RGBA32UI]);
+    const made = (size, formats) => {
+      const target = framebufferOf(gl, size, size, formats);
+      if (isComplete(gl)) return target;
+      throw new Error(`WebGL2: expected framebuffers for ${nChannels} channels, got an incomplete one`);
+    };
+    this.found = made(TILE, [...Array(n).fill(gl.RGBA32UI), gl.RG32UI]);
+    this.colours = made(TILE / 2, [gl.RGBA32UI]);
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
     this.passed = { uOpacity: this.found.textures[n], uColours: this.colours.textures[0] };
     for (let i = 0; i < n; i++) this.passed[`uFound${i}`] = this.found.textures[i];
@@ -237,13 +244,18 @@ export class Renderer {
     this.drawn = view.quality ?? "high"; // info tells it
     if (!view.accumulate || !this.sums || (view.layer ?? "colour") !== "colour") {
       this.nSummed = 0;
-      this.paint(view, null, { upwards: true, premultiplied: true });
+      this.paint({ ...view, jitter: [0, 0] }, null, { upwards: true, premultiplied: true });
       return;
     }
     if (this.sum?.width !== view.width || this.sum.height !== view.height) {
       if (this.sum) deleteFramebuffer(gl, this.sum);
       this.sum = framebufferOf(gl, view.width, view.height, [gl.RGBA16F]);
       this.nSummed = 0;
+      if (!isComplete(gl)) {
+        deleteFramebuffer(gl, this.sum);
+        this.sum = this.sums = null;
+        return this.draw(view);
+      }
     }
     gl.bindFramebuffer(gl.FRAMEBUFFER, this.sum.framebuffer);
     if (this.nSummed === 0) gl.clearBufferfv(gl.COLOR, 0, [0, 0, 0, 0]);

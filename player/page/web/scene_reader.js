@@ -45,10 +45,10 @@ export class SceneReader {
     });
   }
 
-  // Return the arrays of grid.js for the grids, as far as they have been read. `isLast`: see PartsReader.
-  grid(isLast) {
+  // Return the arrays of grid.js for the grids, as far as they have been read.
+  grid() {
     return this.next(() => {
-      const { densities, features } = this.parts.values(isLast);
+      const { densities, features } = this.parts.values();
       return {
         ...(densities && arrangeDensities(this.manifest, densities)),
         ...(features && arrangeFeatures(this.manifest, features)),

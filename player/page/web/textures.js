@@ -44,13 +44,17 @@ function checkSize(gl, target, [width, height, depth]) {
   throw new Error(`memory of the GPU: expected textures of ${largest} texels a side, got at most ${most}`);
 }
 
+// Return whether the bound framebuffer can be drawn to; true if the context is lost.
+export function isComplete(gl) {
+  return gl.isContextLost() || gl.checkFramebufferStatus(gl.FRAMEBUFFER) === gl.FRAMEBUFFER_COMPLETE;
+}
+
 // Throw an Error if the GPU's memory was too small for `what`: if it has run out since the last call, or if the
 // bound framebuffer is incomplete.
 export function checkMemory(gl, what) {
   const errors = [];
   for (let error = gl.getError(); error !== gl.NO_ERROR; error = gl.getError()) errors.push(error);
-  const isWhole = gl.checkFramebufferStatus(gl.FRAMEBUFFER) === gl.FRAMEBUFFER_COMPLETE;
-  if (gl.isContextLost() || (isWhole && !errors.includes(gl.OUT_OF_MEMORY))) return;
+  if (gl.isContextLost() || (isComplete(gl) && !errors.includes(gl.OUT_OF_MEMORY))) return;
   throw new Error(`memory of the GPU: expected enough for ${what}, got too little`);
 }
 

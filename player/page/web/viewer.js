@@ -47,9 +47,20 @@ export class Viewer {
     this.covered = this.pose === pose; // the poster, which shows this pose, stays until all of the scene is there
     this.touchedAt = this.before = performance.now();
     this.asked = 0; // the request for the next tick
-    this.fence = null; // { sync, begin, moving } of the picture that is being drawn
+    // The picture that is being drawn: { sync, begin, moving, ticks: how many have come since, hidden: whether the page was }.
+    this.fence = null;
     new ResizeObserver(() => this.refresh()).observe(canvas);
+    document.addEventListener("visibilitychange", () => {
+      if (this.fence) this.fence.hidden = true;
+    });
+    this.watch();
+  }
+
+  // Draw anew, now and whenever a CSS pixel gets more or fewer pixels of the screen, as when the window moves to another one.
+  watch() {
     this.refresh();
+    const same = matchMedia(`(resolution: ${devicePixelRatio}dppx)`);
+    same.addEventListener("change", () => this.watch(), { once: true });
   }
 
   // Draw anew, because something other than the camera has changed.
@@ -182,7 +193,7 @@ export class Viewer {
     const { quality, pace } = this, size = this.size(), sharp = pace.sharp(...size);
     if (this.n_still === 0 && sharp[0] === size[0]) this.n_still = 1;
     const n = this.n_still - 1; // pictures at full size so far
-    if (n > 0 && this.seconds > FEW_SECONDS) this.n_still = N_WHOLE + 1;
+    if (n > 0 && (this.layer !== "colour" || this.seconds > FEW_SECONDS)) this.n_still = N_WHOLE + 1;
     if (this.n_still > N_WHOLE) {
       this.canvas.dataset.done = "";
       return;
@@ -201,19 +212,22 @@ export class Viewer {
     const { layer, background } = this, begin = performance.now();
     this.renderer.draw({ ...this.view(width, height), quality, background, layer, jitter, accumulate });
     const gl = this.canvas.getContext("webgl2");
-    this.fence = { sync: gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0), begin, moving };
+    this.fence = { sync: gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0), begin, moving, ticks: 0 };
     gl.flush();
   }
 
-  // Return whether the last picture is finished. If it is, the pace adapts to the time that the picture took.
+  // Return whether the last picture is finished. If it is, the pace adapts to the time that the picture took. If the page
+  // was hidden meanwhile, when no ticks come, that time says nothing, and the picture is drawn anew.
   finished() {
-    const gl = this.canvas.getContext("webgl2"), { sync, begin, moving } = this.fence;
+    const gl = this.canvas.getContext("webgl2"), { sync, begin, moving, hidden } = this.fence;
+    const ticks = ++this.fence.ticks;
     if (gl.getSyncParameter(sync, gl.SYNC_STATUS) !== gl.SIGNALED) return false;
     gl.deleteSync(sync);
     this.fence = null;
     this.seconds = (performance.now() - begin) / 1000;
     const pixels = this.drawn[0] * this.drawn[1];
-    if (moving) this.pace.measured(pixels, this.seconds);
+    if (hidden) this.refresh();
+    else if (moving) this.pace.measured(pixels, this.seconds, ticks === 1);
     else this.pace.stood(pixels, this.seconds);
     // data-shown: the size of the picture on the screen; data-done: no more pictures come until something changes
     if (moving || this.n_still > 0) this.canvas.dataset.shown = this.drawn.join("x");

@@ -11,7 +11,7 @@ const CALLS = {
     reader = new SceneReader(manifest, grids, async () => {});
   },
   read: (file) => reader.read(file, (progress) => postMessage({ progress })),
-  grid: (isLast) => reader.grid(isLast),
+  grid: () => reader.grid(),
 };
 
 self.onmessage = async ({ data: { call, args, id } }) => {

@@ -56,9 +56,12 @@ const plain = ({ levels, n_channels, stride, values, firstRows }) => ({
   levels: levels.map((bricks) => ({ coords: coordsOf(bricks.keys), cells: bricks.masks })),
 });
 export const arrangeDensities = (manifest, densities) => ({ densities: plain(densities) });
-export const arrangeFeatures = (manifest, features) => ({ features: plain(features) });
+export const arrangeFeatures = (manifest, features) => ({
+  features: plain(features), handedOver: features.values,
+});
 """
-"""JavaScript in place of `grid.js` that keeps what is decoded as it is."""
+"""JavaScript in place of `grid.js` that keeps what is decoded as it is. As `grid.js` does, it also hands over
+the decoder's own array of the features, which a worker then loses to the page."""
 
 
 def decoder_page(files: Mapping[str, bytes], before: str = "", policy: str = "") -> bytes:

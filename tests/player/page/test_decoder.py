@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -181,6 +182,40 @@ def test_parts_before_a_broken_one_are_shown(chromium: Browser, levels: Asset, t
     found = run(chromium, tmp_path, set_bytes(files, name, bytes(damaged)))
     last = found["scenes"][-1]  # it breaks while it is decoded: what was shown stays
     assert last["problem"].startswith("part_2.bin: ") and last["n_parts"] == 1
+
+
+def with_last_section_apart(folder: Path, to: Path) -> Path:
+    """Copy an asset so that its last section, symbols of a level whose structure is in an earlier part, is a
+    part of its own; return the new folder."""
+    shutil.copytree(folder, to)
+    manifest = json.loads((to / "manifest.json").read_text())
+    part = manifest["parts"][-1]
+    section = part["sections"].pop()
+    assert part["sections"] and section["kind"] == "symbols"
+    data, n_before = (to / part["file"]).read_bytes(), sum(some["bytes"] for some in part["sections"])
+    name = f"part_{len(manifest['parts'])}.bin"
+    manifest["parts"].append({"file": name, "sections": [section]})
+    for file, content in ((part["file"], data[:n_before]), (name, data[n_before:])):
+        (to / file).write_bytes(content)
+        manifest["files"][file] = {"bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()}
+    (to / "manifest.json").write_text(json.dumps(manifest))
+    return to
+
+
+def test_all_parts_before_a_broken_last_one_are_shown(
+    chromium: Browser, levels: Asset, tmp_path: Path
+) -> None:
+    """The grid of the whole scene is asked for before the last part turns out to be broken."""
+    asset = Asset.open(with_last_section_apart(levels.folder, tmp_path / "asset"))
+    files, n_before = scene_files(asset), len(asset.manifest.parts) - 1
+    name = asset.manifest.parts[-1].file
+    damaged = bytearray(files[name])
+    damaged[0] ^= 255
+    found = run(chromium, tmp_path, {**files, name: bytes(damaged)})
+    assert found["error"] is None
+    last = found["scenes"][-1]
+    assert f"{name}: sha256" in last["problem"] and last["n_parts"] == n_before
+    assert without_problem(last) == expected(Asset.open(asset.folder, parts=n_before))
 
 
 SECTIONS: list[tuple[str, Callable[[bytearray], object]]] = [

@@ -240,21 +240,51 @@ def test_a_page_plays_from_a_disk(chromium: Browser, asset: Asset, tmp_path: Pat
         assert [url for url in found.asked if not url.startswith(("blob:", "data:"))] == [path.as_uri()]
 
 
-def test_a_site_plays_from_a_server(chromium: Browser, asset: Asset) -> None:
+SITE = "http://localhost/scene/"
+
+
+def site(asset: Asset, before_worker: bytes = b"") -> dict[str, tuple[bytes, str]]:
+    """Return what a server at SITE answers; the worker begins with `before_worker`."""
     kinds = {".js": "text/javascript", ".html": "text/html", ".css": "text/css", ".jpg": "image/jpeg"}
-    address = "http://localhost/scene/"
-    files = {"": page_of_many_files(asset).files["index.html"], **page_of_many_files(asset).files}
+    files = page_of_many_files(asset).files
+    files["worker.js"] = before_worker + files["worker.js"]
     answers = {
-        address + name: (
-            data,
-            kinds.get(Path(name or ".html").suffix or name or ".html", "application/octet-stream"),
-        )
+        SITE + name: (data, kinds.get(Path(name).suffix, "application/octet-stream"))
         for name, data in files.items()
     }
-    with opened(chromium, address, answers) as found:
+    return {SITE: answers[SITE + "index.html"], **answers}
+
+
+def test_a_site_plays_from_a_server(chromium: Browser, asset: Asset) -> None:
+    answers = site(asset)
+    with opened(chromium, SITE, answers) as found:
         check_plays(found)
         assert set(found.asked) <= set(answers)
-        assert {address + name for name in ("poster.jpg", "worker.js", "part_0.bin")} <= set(found.asked)
+        assert {SITE + name for name in ("poster.jpg", "worker.js", "part_0.bin")} <= set(found.asked)
+
+
+def check_advises_another_device(found: Opened) -> str:
+    """Check that the page says what to open it in, not to load it again; return what it says."""
+    found.page.wait_for_selector("body.failed")
+    said = found.page.inner_text("#status")
+    assert "Open this page in a current" in said and "again" not in said
+    return said
+
+
+def test_a_site_in_a_browser_that_cannot_decode_it_names_others(chromium: Browser, asset: Asset) -> None:
+    answers = site(asset, b"delete self.DecompressionStream;\n")
+    with opened(chromium, SITE, answers) as found:
+        said = check_advises_another_device(found)
+        assert "expected a browser with DecompressionStream, got an older one" in said
+
+
+def test_a_scene_that_takes_too_much_memory_to_decode_asks_for_another_device(
+    chromium: Browser, asset: Asset, tmp_path: Path
+) -> None:
+    path = tmp_path / "scene.html"
+    path.write_bytes(re.sub(rb'"n_vertices":\d+', b'"n_vertices":1073741824', page(asset)))
+    with opened(chromium, path.as_uri()) as found:
+        assert "MB of memory: expected at most 3200 MB" in check_advises_another_device(found)
 
 
 def test_a_page_that_was_cut_short_says_so(chromium: Browser, asset: Asset, tmp_path: Path) -> None:

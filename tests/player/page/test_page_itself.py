@@ -178,5 +178,10 @@ def test_a_notebook_shows_it_below_a_cell(chromium: Browser, asset: Asset, tmp_p
     ) == ("SecurityError")
     assert frame.evaluate("() => vfr.ready.then(() => vfr.info.n_channels)") == asset.manifest.n_channels
     assert frame.evaluate("() => vfr.info.quality") in ("high", "fast")
+    card = frame.locator("#card")
+    frame.locator("#help").click()
+    assert card.is_visible()
+    frame.locator("#close").click()
+    assert not card.is_visible()
     context.close()
     assert not said

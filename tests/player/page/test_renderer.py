@@ -19,6 +19,7 @@ from player.asset.grid import DISTANCE_BITS, MAX_DISTANCE, SparseGrid
 from player.cameras.camera import Camera
 from player.page.gpu_memory import gpu_bytes
 from player.render import Renderer
+from player.viewer.layers import coloured
 from tests.numerics.bounds import Row
 from tests.player.page import scenes
 from tests.player.page.render_page import RenderPage
@@ -116,7 +117,8 @@ def test_any_background(scene: Scene, background: Any) -> None:
 
 
 def test_layers_are_the_players(scene: Scene) -> None:
-    """Opacity and clear normals are the player's, and there is no depth where the opacity is below 0.4."""
+    """Opacity, depth and clear normals are the player's, and there is no depth where the opacity is below
+    0.4."""
     camera = scene.cameras["outside"]
     frame = scene.player.render(camera)
     opacity = scene.page.picture(camera, layer="opacity")[..., 0]
@@ -129,6 +131,13 @@ def test_layers_are_the_players(scene: Scene) -> None:
         NORMALS.check(np.quantile(off, 0.98))
     depth = scene.page.picture(camera, layer="depth")[..., :3]
     assert not depth[frame.opacity < 0.4].any()
+    low, high = np.array(scene.asset.manifest.aabb)
+    eye = (np.linalg.inv(scene.asset.world_from_model) @ [*camera.c2w[:3, 3], 1])[:3]
+    away, radius = np.linalg.norm((low + high) / 2 - eye), np.linalg.norm(high - low) / 2
+    near, far = scene.asset.scale * np.array([max(away - radius, 0), away + radius])
+    wanted, solid = 255 * coloured(1 - (frame.depth - near) / (far - near)), frame.opacity > 0.6
+    if solid.any():
+        assert np.quantile(np.abs(depth - wanted)[solid], 0.98) <= 2
 
 
 def test_the_arrays_are_the_players(scene: Scene) -> None:

@@ -71,6 +71,18 @@ def canvas(page: RenderPage, view: dict[str, Any], jitters: list[tuple[float, fl
     return found.reshape(view["height"], view["width"], 4)[::-1]
 
 
+def test_a_picture_without_a_quality_is_exact(page: RenderPage, asset: Asset) -> None:
+    camera = scenes.cameras(asset)["outside"]
+    page.page.evaluate("() => { renderer.scene.manifest.quality_fetches = [1, 1]; }")
+    try:
+        plain, exact, high = (
+            page.picture(camera, **more) for more in ({}, {"quality": "exact"}, {"quality": "high"})
+        )
+    finally:
+        page.page.evaluate("() => { delete renderer.scene.manifest.quality_fetches; }")
+    assert (plain == exact).all() and not (exact == high).all()
+
+
 def test_depths_are_where_half_the_opacity_is(page: RenderPage, asset: Asset) -> None:
     camera = scenes.cameras(asset)["outside"]
     model = camera.transformed(np.linalg.inv(asset.world_from_model))
@@ -125,6 +137,50 @@ def test_pictures_add_up_to_their_mean(page: RenderPage, asset: Asset) -> None:
     assert np.abs(wanted - page.picture(camera, **settings)).max() > 8, "the pictures differ"
     again = canvas(page, view_of(camera) | settings, jitters)
     ANEW.holds(again == shown)
+
+
+def test_where_no_sums_can_be_drawn_the_last_picture_is_shown_unmoved(page: RenderPage, asset: Asset) -> None:
+    view = view_of(scenes.cameras(asset)["outside"]) | {"quality": "exact", "width": 62}
+    unmoved = canvas(page, view, [])
+    page.page.evaluate(
+        """() => {
+          const { gl, sums } = renderer;
+          globalThis.sumsAgain = () => {
+            delete gl.checkFramebufferStatus;
+            renderer.sums = sums;
+          };
+          gl.checkFramebufferStatus = () => gl.FRAMEBUFFER_UNSUPPORTED;
+        }"""
+    )
+    shown = canvas(page, view, [(0.4, -0.3), (-0.25, 0.45)])
+    page.page.evaluate("() => sumsAgain()")
+    assert (shown == unmoved).all()
+    assert (canvas(page, view, [(0.4, -0.3)]) != unmoved).any(), "sums are drawn again, of moved pictures"
+
+
+@pytest.mark.parametrize("layer", ["depth", "normals", "opacity"])
+def test_layers_that_are_not_added_up_are_shown_unmoved(page: RenderPage, asset: Asset, layer: str) -> None:
+    view = view_of(scenes.cameras(asset)["outside"]) | {"quality": "exact", "layer": layer}
+    unmoved = canvas(page, view, [])
+    assert np.ptp(unmoved) > 100, "there is something to see"
+    assert (canvas(page, view, [(0.4, -0.3), (-0.25, 0.45)]) == unmoved).all()
+
+
+@pytest.mark.parametrize("n", [0, 1], ids=["found", "colours"])
+def test_a_graphics_card_that_cannot_draw_the_channels_is_told(page: RenderPage, n: int) -> None:
+    """The first framebuffer that a renderer makes holds what the march finds, the second the colours."""
+    told = page.page.evaluate(
+        """async (n) => {
+          const canvas = document.createElement("canvas"), gl = canvas.getContext("webgl2");
+          const { FRAMEBUFFER_COMPLETE, FRAMEBUFFER_UNSUPPORTED } = gl;
+          let asked = 0;
+          gl.checkFramebufferStatus = () => (asked++ === n ? FRAMEBUFFER_UNSUPPORTED : FRAMEBUFFER_COMPLETE);
+          const making = renderer.constructor.create(canvas, { ...renderer.scene, grid: null });
+          return making.then(() => "a renderer", (error) => error.message);
+        }""",
+        n,
+    )
+    assert told == "WebGL2: expected framebuffers for 4 channels, got an incomplete one"
 
 
 def test_a_lost_context_comes_back(page: RenderPage, asset: Asset) -> None:

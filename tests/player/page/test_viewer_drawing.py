@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import io
 import math
 from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 from playwright.sync_api import Browser
 
 from tests.player.page.drawn_views import FILES, TARGET, UP, VIEWS, distance, drag, height, pixel
@@ -60,6 +62,45 @@ def test_the_window_may_change_its_size(chromium: Browser) -> None:
         wait_for(page, lambda: page.evaluate("() => drawn.at(-1).width") == 200)
 
 
+def test_a_window_that_moves_to_a_screen_of_smaller_pixels_is_drawn_anew(chromium: Browser) -> None:
+    with opened(chromium, FILES, "#turn=off") as (page, *_):
+        before = still(page)
+        client = page.context.new_cdp_session(page)
+        metrics = {"width": 640, "height": 480, "deviceScaleFactor": 2, "mobile": False}
+        client.send("Emulation.setDeviceMetricsOverride", metrics)
+        wait_for(page, lambda: page.evaluate("() => drawn.at(-1).width") == 1280)
+        after = still(page)
+        assert [after["width"], after["height"]] == [2 * before["width"], 2 * before["height"]]
+
+
+def test_layers_that_are_not_added_up_are_drawn_once_at_full_size(chromium: Browser) -> None:
+    with opened(chromium, FILES, "#turn=off") as (page, *_):
+        still(page)
+        page.keyboard.press("2")
+        wait_for(page, lambda: page.evaluate("() => drawn.at(-1).layer") == "depth")
+        assert still(page)["width"] == 640
+        whole = page.evaluate("() => drawn.filter((view) => view.layer === 'depth' && view.accumulate)")
+        assert len(whole) == 1
+
+
+def test_a_page_that_is_hidden_while_a_picture_is_drawn_is_sharp_afterwards(chromium: Browser) -> None:
+    with opened(chromium, FILES, "#turn=off", viewport={"width": 1200, "height": 900}) as (page, *_):
+        page.evaluate("() => { globalThis.rate = 3e6; }")
+        drag(page, 30, 0)
+        before = still(page)
+        n = page.evaluate("() => drawn.length")
+        page.evaluate("() => { const { gl } = renderer; gl.getSyncParameter = () => gl.UNSIGNALED; }")
+        page.keyboard.press("3")
+        page.wait_for_function("n => drawn.length > n", arg=n)
+        page.evaluate("() => document.dispatchEvent(new Event('visibilitychange'))")
+        page.wait_for_timeout(3000)  # in which nothing is drawn
+        assert page.evaluate("() => drawn.length") == n + 1
+        page.evaluate("() => { delete renderer.gl.getSyncParameter; }")
+        after = still(page)
+        assert [before["width"], before["height"]] == [1200, height(page)]
+        assert [after["width"], after["height"]] == [1200, height(page)]
+
+
 def test_a_finer_scene_and_a_lost_context(chromium: Browser) -> None:
     with opened(chromium, FILES, "#turn=off") as (page, *_):
         still(page)
@@ -95,6 +136,20 @@ def test_embedded_it_takes_the_wheel_once_it_was_clicked(chromium: Browser) -> N
         page.mouse.wheel(0, 200)
         frame.wait_for_function("n => drawn.length > n", arg=n)
         assert page.evaluate("() => scrollY") == 0
+
+
+def test_embedded_with_a_transparent_background_it_shows_the_page_around_it(chromium: Browser) -> None:
+    """A frame is opaque if its colour scheme is not that of the page around it, as on a dark system."""
+    outer = b"<!doctype html><body style='margin: 0; background: #0f0'><iframe width=500 height=300 "
+    outer += b"style='border: 0' src='index.html#turn=off&noui&background=transparent'></iframe>"
+    files = {**FILES, "outer.html": outer}
+    with opened(chromium, files, wait=False, color_scheme="dark") as (page, *_):
+        page.goto("http://localhost/scene/outer.html")
+        frame = page.frames[1]
+        frame.wait_for_selector("#canvas[data-done]")
+        assert frame.evaluate("() => getComputedStyle(document.documentElement).colorScheme") == "light"
+        with Image.open(io.BytesIO(page.screenshot())) as picture:
+            assert picture.convert("RGB").getpixel((5, 5)) == (0, 255, 0)
 
 
 @pytest.mark.parametrize("why", ["no WebGL 2", "a broken file"])
@@ -175,6 +230,19 @@ def test_a_finer_scene_that_does_not_fit_leaves_the_coarse_one(chromium: Browser
         assert said.startswith(f"This scene cannot be shown whole here: {why}. Open this page in a current")
         assert page.locator("#bar").is_visible() and not page.locator("#progress").is_visible()
         assert page.evaluate("() => vfr.ready.then(() => null, (error) => error.message)") == why
+
+
+def test_a_scene_that_lacks_a_part_is_shown_but_is_not_ready(chromium: Browser) -> None:
+    why = "part_1.bin: expected 5 bytes, got 3: shown as the first 1 of 2 parts have it"
+    before, _, behind = loader_of_parts().rpartition('"problem": null')
+    files = page_files(f'{before}"problem": "{why}"{behind}')
+    with opened(chromium, files, "#turn=off", wait=False) as (page, *_):
+        page.wait_for_function("() => globalThis.go")
+        page.evaluate("() => go()")
+        page.wait_for_selector("#canvas[data-done]")
+        assert page.locator("#status").text_content() == why and page.locator("#bar").is_visible()
+        for asked in ("vfr.ready", "vfr.render({})"):
+            assert page.evaluate(f"() => {asked}.then(() => null, (error) => error.message)") == why
 
 
 @pytest.mark.parametrize("first", ["{}", "null"], ids=["after the first part", "before the first part"])
