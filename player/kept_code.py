@@ -17,10 +17,10 @@ from __future__ import annotations
 
 import hashlib
 import os
+import secrets
 import shutil
 import stat
 import sys
-import tempfile
 from collections.abc import Callable
 from contextlib import suppress
 from functools import lru_cache, partial
@@ -100,7 +100,9 @@ def place(*packages: Path) -> Place:
             new = _make(folder)
             # Whoever may write beside the sources may change the sources themselves.
             if _is_ours(folder) and (root == beside or _is_ours(root)):
-                tempfile.TemporaryFile(dir=folder).close()
+                probe = folder / f"probe-{secrets.token_hex(4)}"  # `tempfile` tries for hours on Windows
+                probe.touch()
+                probe.unlink()
                 os.utime(folder)  # marks it as used now
                 if new:
                     _remove_old(root, folder)

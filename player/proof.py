@@ -26,6 +26,13 @@ from player.compiling import SOURCES, available, first_use, not_kept
 RIGHT, WRONG = "right", "wrong: "
 DEADLY = ("SIGABRT", "SIGILL", "SIGSEGV", "SIGBUS", "SIGFPE", "SIGTRAP")
 """Signals that end a process which runs wrong code. Any other end says nothing about the code."""
+DEADLY_ON_WINDOWS = (
+    *(3, 0x80000003),  # abort, breakpoint
+    *(0xC0000005, 0xC000001D, 0xC0000096),  # access violation, illegal and privileged instruction
+    *(0xC0000094, 0xC000008E, 0xC00000FD),  # division by zero of integers and floats, stack overflow
+    *(0xC0000374, 0xC0000409),  # damaged heap, damaged stack
+)
+"""Exit codes of the same ends on Windows. Ctrl-C, for example, ends a process with 0xC000013A."""
 _verdicts: dict[Path | None, str] = {}
 
 
@@ -102,7 +109,7 @@ def _asked(say: Any) -> str | None:
 def _deadly(code: int) -> str | None:
     """Return the name of what ended a process, if wrong code ends processes in that way; else None."""
     if sys.platform == "win32":
-        return f"exit code {code:#x}" if code == 3 or code >= 0xC0000000 else None
+        return f"exit code {code:#x}" if code in DEADLY_ON_WINDOWS else None
     return next((name for name in DEADLY if getattr(signal, name, None) == -code), None)
 
 

@@ -4,15 +4,26 @@ content or the complete new one."""
 from __future__ import annotations
 
 import os
+import secrets
 import stat
-import tempfile
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO
 
 from player.errors import FormatError, OutputError
-from player.files.replace import PART, clear_up, held, put_folder, put_together, remove, sync, sync_all
+from player.files.replace import (
+    PART,
+    clear_up,
+    held,
+    put_folder,
+    put_together,
+    remove,
+    rename,
+    sync,
+    sync_all,
+)
 
 _KINDS = {
     stat.S_IFDIR: "a folder",
@@ -123,8 +134,30 @@ def check_target(path: Path, force: bool = False, is_file: bool = False) -> None
         raise OutputError(f"{path}: cannot write: {error.strerror or error}") from error
     if not above.is_dir():
         raise OutputError(f"{path}: cannot write: {above} is a file, not a folder")
-    if not os.access(above, os.W_OK):
+    if not _takes_files(above):
         raise OutputError(f"{path}: cannot write: the folder {above} is read-only")
+
+
+def _takes_files(folder: Path) -> bool:
+    """Return whether files can be made in `folder`. Windows only tells if one is made."""
+    if sys.platform != "win32":
+        return os.access(folder, os.W_OK)
+    try:
+        probe = _temporary_name(folder / "probe")
+        probe.touch()
+        probe.unlink()
+    except OSError:
+        return False
+    return True
+
+
+def _temporary_name(path: Path) -> Path:
+    """Return a new name beside `path`, by which `player.files.replace` knows what is not complete yet.
+
+    It is made here because the functions of `tempfile` try for hours on Windows where nothing may be written,
+    and make folders that nobody else may read.
+    """
+    return path.with_name(f".{path.name}.{secrets.token_hex(4)}{PART}")
 
 
 def write_bytes(path: Path, data: bytes) -> None:
@@ -176,15 +209,13 @@ def _writing(path: Path) -> Iterator[None]:
 
 
 def _write_one(path: Path, data: bytes) -> None:
-    handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=PART, dir=path.parent)
-    temporary = Path(name)
+    temporary = _temporary_name(path)
     try:
-        with os.fdopen(handle, "wb") as file:
+        with temporary.open("xb") as file:
             file.write(data)
             file.flush()
             os.fsync(file.fileno())
-        temporary.chmod(0o666 & ~_umask())
-        temporary.replace(path)
+        rename(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
 
@@ -199,7 +230,7 @@ def new_file(path: Path) -> Iterator[Path]:
     with _writing(path), _temporary_folder(path) as folder:
         yield folder / path.name
         sync(folder / path.name)
-        (folder / path.name).replace(path)
+        rename(folder / path.name, path)
 
 
 @contextmanager
@@ -220,15 +251,9 @@ def new_folder(path: Path, force: bool = False) -> Iterator[Path]:
 @contextmanager
 def _temporary_folder(path: Path) -> Iterator[Path]:
     """Yield a new folder beside `path`; whatever has its name when the block ends is removed."""
-    folder = Path(tempfile.mkdtemp(prefix=f".{path.name}.", suffix=PART, dir=path.parent))
+    folder = _temporary_name(path)
+    folder.mkdir()
     try:
-        folder.chmod(0o777 & ~_umask())
         yield folder
     finally:
         remove(folder)
-
-
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask

@@ -26,6 +26,7 @@ import os
 import re
 import shutil
 import sys
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from functools import cache
@@ -34,6 +35,8 @@ from pathlib import Path
 from player.errors import OutputError
 
 PART = ".part"
+PAUSES = (0.05, 0.1, 0.2, 0.5, 1.0, 2.0)
+"""Seconds between the tries to rename a file that another program has open, on Windows."""
 _PARTS = re.compile(r"\..+\.[a-z0-9_]{8}\.part", re.DOTALL)  # names as tempfile makes them
 _TOGETHER = re.compile(r"\.(.+)\.together", re.DOTALL)
 _REPLACED = re.compile(r"\.(.+)\.replaced", re.DOTALL)
@@ -100,22 +103,35 @@ def put_folder(new: Path, path: Path) -> None:
     Raises OSError: the old folder still has its name. OutputError: it has the name that the message says.
     """
     if not os.path.lexists(path):
-        new.replace(path)
+        rename(new, path)
         return
     if exchange(new, path):
         sync(path.parent)
         return
     aside = path.with_name(f".{path.name}.replaced")
     remove(aside)
-    path.replace(aside)
+    rename(path, aside)
     try:
-        new.replace(path)
+        rename(new, path)
     except BaseException:
         if not path.exists():
             _restore(aside, path)
         raise
     sync(path.parent)
     remove(aside)
+
+
+def rename(path: Path, to: Path) -> None:
+    """Rename `path`; a file `to` is replaced. On Windows, this is tried again for some seconds while another
+    program, such as a scanner for viruses, has a file open."""
+    for pause in PAUSES if sys.platform == "win32" else ():
+        try:
+            path.replace(to)
+        except PermissionError:
+            time.sleep(pause)
+        else:
+            return
+    path.replace(to)
 
 
 def _restore(aside: Path, path: Path) -> None:

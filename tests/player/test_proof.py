@@ -143,3 +143,11 @@ if os.name == "posix":
         (tmp_path / "told").chmod(0o777)
         (line,) = lines()
         assert f"{tmp_path / 'told'}: expected a folder that nobody else may write to" in line
+
+
+@pytest.mark.parametrize(("code", "deadly"), [(0xC0000005, True), (3, True), (0, False), (0xC000013A, False)])
+def test_on_windows_ctrl_c_says_nothing_about_the_code(
+    code: int, deadly: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "platform", "win32")
+    assert (proof._deadly(code) is not None) == deadly

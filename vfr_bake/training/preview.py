@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 from PIL import Image
 
+from player.errors import OutputError
 from player.files.images import to_8_bit, write_png
 from vfr_bake.data.scene import Scene
 from vfr_bake.data.witnesses import whole_views
@@ -50,12 +52,17 @@ class Preview:
         self._due = SECONDS / 4
 
     def update(self, trainer: Trainer) -> None:
-        """Write the preview if SECONDS of training have passed since the last one. Raises OutputError."""
+        """Write the preview if SECONDS of training have passed since the last one."""
         if trainer.seconds >= self._due:
             self.write(trainer)
             self._due = trainer.seconds + SECONDS
 
     def write(self, trainer: Trainer) -> None:
-        """Write photograph | rendered | error map, replacing the last preview. Raises OutputError."""
+        """Write photograph | rendered | error map, replacing the last preview.
+
+        A preview that cannot be written, for example because a program on Windows has the last one open, is
+        left out, and training goes on.
+        """
         rgb = render_image(trainer.field, trainer.sampler, self._camera, self._background)
-        write_png(self._path, comparison(self._photograph, rgb))
+        with suppress(OutputError):
+            write_png(self._path, comparison(self._photograph, rgb))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import errno
 import io
 import os
-import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -74,13 +73,52 @@ def read_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]
     folder.mkdir()
     folder.chmod(0o555)
     if os.access(folder, os.W_OK):  # root may write: imitate the system's answer
-        monkeypatch.setattr(tempfile, "mkstemp", refuse(errno.EACCES))
-        monkeypatch.setattr(tempfile, "mkdtemp", refuse(errno.EACCES))
+        monkeypatch.setattr("player.files.files._temporary_name", refuse(errno.EACCES))
     yield folder
     folder.chmod(0o755)
 
 
 # --- check_target ---
+
+
+@pytest.mark.parametrize("may_write", [True, False])
+def test_on_windows_a_folder_is_tried(
+    may_write: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Windows says of every folder that it can be written to, so a file is made there and removed."""
+    monkeypatch.setattr("player.files.files.sys.platform", "win32")
+    monkeypatch.setattr(os, "access", lambda path, mode: True)
+    if may_write:
+        check_target(tmp_path / "target")
+    else:
+        monkeypatch.setattr(Path, "touch", refuse(errno.EACCES))
+        with pytest.raises(OutputError, match="is read-only"):
+            check_target(tmp_path / "target")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(("n_refused", "arrives"), [(0, True), (2, True), (4, False)])
+def test_on_windows_a_name_is_given_again_while_a_program_has_the_file_open(
+    n_refused: int, arrives: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("player.files.replace.sys.platform", "win32")
+    monkeypatch.setattr("player.files.replace.PAUSES", (0.0, 0.0, 0.0))
+    usual, refusals = Path.replace, iter([True] * n_refused)
+
+    def replace(path: Path, to: Path) -> Path:
+        if next(refusals, False):
+            raise PermissionError(errno.EACCES, "in use")
+        return usual(path, to)
+
+    monkeypatch.setattr(Path, "replace", replace)
+    target = tmp_path / "a.bin"
+    if arrives:
+        write_bytes(target, b"new")
+        assert target.read_bytes() == b"new"
+    else:
+        with pytest.raises(OutputError, match="cannot write: in use"):
+            write_bytes(target, b"new")
+        assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("kind", ["file", "folder"])
@@ -118,7 +156,7 @@ def test_a_failure_midway_leaves_the_old_file(
     path = tmp_path / "file.bin"
     path.write_bytes(b"old content")
     if step == "write":
-        monkeypatch.setattr(os, "fdopen", lambda handle, mode: FullDisk(handle, mode))
+        monkeypatch.setattr(Path, "open", lambda path, mode: FullDisk(path, mode))
     elif step == "fsync":
         monkeypatch.setattr(os, "fsync", refuse(errno.ENOSPC))
     else:
@@ -142,7 +180,7 @@ def test_an_interrupt_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.Mo
 
 
 def test_a_failure_leaves_nothing_where_nothing_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(os, "fdopen", lambda handle, mode: FullDisk(handle, mode))
+    monkeypatch.setattr(Path, "open", lambda path, mode: FullDisk(path, mode))
     with pytest.raises(OutputError, match=FULL):
         write_bytes(tmp_path / "file.bin", b"new content")
     assert names(tmp_path) == []
