@@ -167,8 +167,9 @@ class Renderer:
         picture = self._blank(camera, background, k, reduced.opaque_depth, layers)
         for stage in stages(reduced.levels, picture.view.grid.contracted):
             self._in_tasks(picture, stage)
-        planes, shape, features = picture.planes, (camera.height, camera.width), picture.features
-        normals = self._all_normals(picture.view, self._pool.map) if layers else None
+        view, planes, features = picture.view, picture.planes, picture.features
+        shape = (camera.height, camera.width)
+        normals = self._all_normals(view, self._pool.map) if layers else None
         return Frame(
             planes.rgb.reshape(*shape, 3),
             planes.opacity.reshape(shape),
@@ -176,7 +177,7 @@ class Renderer:
             planes.n_density_samples.reshape(shape),
             background,
             None if features is None else features.reshape(*shape, -1),
-            lambda: self._all_normals(picture.view) if normals is None else normals,
+            lambda: self._all_normals(view) if normals is None else normals,
         )
 
     def _reduced(self, quality: Quality) -> _Reduced:

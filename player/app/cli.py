@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from player.app.commands import run, write_result
 from player.app.option_types import DEMO
-from player.app.options import PlaySettings, parse, settings_of
+from player.app.options import PlaySettings, given, parse, settings_of
 from player.errors import ConfigError, FormatError, VfrError
 from player.progress import Bar, duration
 from player.terminal import picture_lines, printable
@@ -39,8 +39,9 @@ def _run(arguments: argparse.Namespace) -> int:
     if arguments.info:
         return _info(arguments)
     if arguments.output is None:
-        # The demo must work without any extra installed.
-        no_viewer = arguments.asset == DEMO and find_spec("viser") is None
+        # The demo must work without any extra installed. Other options and more assets need the viewer.
+        demo_alone = arguments.asset == DEMO and set(given(arguments)) <= {"max_memory"}
+        no_viewer = demo_alone and find_spec("viser") is None
         return _open_page(arguments) if no_viewer else _view(arguments)
     return _play(arguments)
 
@@ -146,8 +147,8 @@ def _views(asset: Asset, arguments: argparse.Namespace) -> list[Camera]:
     from player.cameras.views import asset_cameras, read_views
 
     width, height = asset.manifest.view_size
-    given = arguments.cameras
-    cameras = asset_cameras(asset) if given is None else read_views(given, (width, height))
+    file = arguments.cameras
+    cameras = asset_cameras(asset) if file is None else read_views(file, (width, height))
     if arguments.orbit is not None:
         return orbit(cameras, arguments.orbit, arguments.size or (width, height))
     if arguments.view is not None:

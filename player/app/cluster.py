@@ -2,8 +2,8 @@
 bytes of the frame's file.
 
 Workers open the asset at the path that the client was given, made absolute: it must be on a shared disk, or a
-copy must be at the same place. Each worker checks that it has the same asset, so that no frame of another
-asset slips in.
+copy must be at the same place. Each worker checks that it has the same asset and as many of its parts, so
+that no frame of another asset or of an incomplete copy slips in.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ may restart."""
 
 
 def render_on_cluster(
-    address: str, folder: Path, jobs: Sequence[Job], settings: PlaySettings
+    address: str, asset: Asset, jobs: Sequence[Job], settings: PlaySettings
 ) -> Iterator[Done]:
     """Yield every job once, in the order in which they are finished.
 
@@ -39,12 +39,13 @@ def render_on_cluster(
 
     Args:
         address: the address of the scheduler, for example tcp://10.0.0.1:8786.
-        folder: the asset's folder, which the workers see at the same path.
+        asset: the open asset, whose folder the workers see at the same path.
         jobs: the frames to render.
         settings: how the frames are rendered; `threads` and `max_memory` are those of one worker.
 
     Raises:
         MissingExtraError: dask.distributed is not installed.
+        IntegrityError: a worker has another asset at that path, or another number of its parts.
         VfrError: no scheduler answers, no worker is left, or a frame fails on its worker.
     """
     try:
@@ -58,24 +59,24 @@ def render_on_cluster(
         client = distributed.Client(address, timeout=CONNECT_SECONDS)
     except (OSError, TimeoutError, ValueError) as error:
         raise ConfigError(f"--dask: {address}: expected a scheduler to answer, got none: {error}") from error
-    digest = _digest(folder)
+    which = str(asset.folder.resolve()), _digest(asset.folder), asset.n_parts
     how = settings.threads, settings.march, settings.max_memory
     with client:
-        futures = {
-            client.submit(_task, str(folder.resolve()), digest, job, *how, pure=False): job for job in jobs
-        }
-        pending, alone = set(futures), 0
-        while pending:
+        futures = {client.submit(_task, job, *which, *how, pure=False): job for job in jobs}
+        alone = 0
+        while futures:
             try:
-                ready: Any = distributed.wait(pending, timeout=POLL_SECONDS, return_when="FIRST_COMPLETED")
+                ready: Any = distributed.wait(
+                    list(futures), timeout=POLL_SECONDS, return_when="FIRST_COMPLETED"
+                )
             except (TimeoutError, asyncio.TimeoutError):  # two classes before Python 3.11
                 alone = 0 if client.scheduler_info()["workers"] else alone + 1
                 if alone == PATIENCE:
                     raise VfrError(f"--dask: {address}: expected workers, got none for a minute") from None
                 continue
-            for future in ready.done:
-                pending.discard(future)
-                yield _result(future, address, futures[future])
+            while ready.done:  # a worker keeps a frame for as long as anything here refers to its future
+                future = ready.done.pop()
+                yield _result(future, address, futures.pop(future))
 
 
 def _result(future: Any, address: str, job: Job) -> Done:
@@ -87,20 +88,22 @@ def _result(future: Any, address: str, job: Job) -> Done:
         raise VfrError(f"--dask: {address}: {job.camera.name}: {type(error).__name__}: {error}") from error
 
 
-def _task(folder: str, digest: str, job: Job, *how: Any) -> Done:
+def _task(job: Job, folder: str, digest: str, n_parts: int, *how: Any) -> Done:
     """Render a frame on a worker; `how` are the last arguments of `_renderer`. The settings are not passed as
     a whole, because a path in them would not reach a worker of another system."""
     if _digest(Path(folder)) != digest:
         raise IntegrityError(f"{folder}: on a worker: expected the asset of the client, got another")
-    return render_job(_renderer(folder, digest, *how), job)
+    return render_job(_renderer(folder, digest, n_parts, *how), job)
 
 
 @lru_cache(maxsize=1)
 def _renderer(
-    folder: str, digest: str, threads: int | None, march: March, max_memory: float | None
+    folder: str, digest: str, n_parts: int, threads: int | None, march: March, max_memory: float | None
 ) -> Renderer:
     """Return the worker's renderer, which is kept for the next frames; the digest tells a new asset from an
     old one.
+
+    Raises IntegrityError unless the asset has `n_parts` parts here: with fewer, frames would be coarser.
 
     Compiled code is proven first, because wrong code would end the worker's process.
     """
@@ -108,7 +111,13 @@ def _renderer(
         from player.proof import prove
 
         prove(lambda text: None)
-    return Renderer(Asset.open(folder, max_memory=max_memory), threads, march)
+    asset = Asset.open(folder, max_memory=max_memory)
+    if asset.n_parts != n_parts:
+        raise IntegrityError(
+            f"{folder}: on a worker: parts: expected {n_parts} as on the client, got {asset.n_parts}: "
+            "copy the whole asset to every machine"
+        )
+    return Renderer(asset, threads, march)
 
 
 def _digest(folder: Path) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import io
 import json
 import os
 import select
@@ -30,11 +31,15 @@ def run(name: str, command: Callable[[], int]) -> int:
 
     The argument of a KeyboardInterrupt, if any, is printed, too: it may say what became of the work.
 
+    Characters that standard output cannot hold, for example those of a path, are written as escapes.
+
     >>> run("vfr-play", lambda: 0)
     0
     """
     try:
         try:
+            if isinstance(sys.stdout, io.TextIOWrapper):  # not so in a notebook, which takes every character
+                sys.stdout.reconfigure(errors="backslashreplace")
             return command()
         finally:
             _flush()
@@ -117,7 +122,7 @@ def _nobody_reads() -> bool:
     asked = select.poll()
     for _, stream in _streams():
         with suppress(OSError):  # the stream is no file, as in tests
-            asked.register(stream.fileno(), 0)  # report errors only
+            asked.register(stream.fileno(), select.POLLOUT)  # macOS reports no errors if nothing is asked for
     return any(events & (select.POLLERR | select.POLLHUP) for _, events in asked.poll(0))
 
 

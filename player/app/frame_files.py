@@ -2,8 +2,8 @@
 exist already.
 
 A picture carries a key: a digest of the asset, the camera and the settings that it was rendered with. A
-resumed run skips the frames that exist with the right key, so that frames of two different runs are never
-mixed.
+resumed run skips the frames that exist with the right key, so that frames of two different runs, or of an
+incomplete copy and a whole one, are never mixed.
 """
 
 from __future__ import annotations
@@ -122,9 +122,11 @@ def frame_key(asset: Asset, camera: Camera, settings: PlaySettings) -> str:
     k = asset.manifest.n_fetches if settings.samples is None else settings.samples
     behind = asset.manifest.background if settings.background is None else settings.background
     lens = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
-    facts = json.dumps([camera.c2w.tolist(), lens, k, behind, settings.quality])
+    facts = [camera.c2w.tolist(), lens, k, behind, settings.quality]
+    if asset.n_parts < len(asset.manifest.parts):  # the picture is coarser than one of the whole asset
+        facts.append(asset.n_parts)
     manifest = read_bytes(asset.folder / NAME, "a manifest", MAX_BYTES, asset.folder)
-    return hashlib.sha256(manifest + facts.encode()).hexdigest()
+    return hashlib.sha256(manifest + json.dumps(facts).encode()).hexdigest()
 
 
 def unfinished(paths: Sequence[Path], keys: Sequence[str], cameras: Sequence[Camera]) -> list[int]:

@@ -8,6 +8,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -112,7 +113,7 @@ def play(
     done: list[Done] = []
     for frame in _rendered(asset, jobs, settings):
         write_bytes(paths[missing[frame.index]], frame.data)
-        done.append(frame)
+        done.append(replace(frame, data=b""))  # the files of a long film would fill the memory
         advance(len(done), len(jobs), frame.milliseconds)
     target.finish(paths, settings.fps)
     figures = _figures(asset, chosen[0], done, settings)
@@ -124,7 +125,7 @@ def _rendered(asset: Asset, jobs: Sequence[Job], settings: PlaySettings) -> Iter
     if settings.dask:
         from player.app.cluster import render_on_cluster
 
-        yield from render_on_cluster(settings.dask, asset.folder, jobs, settings)
+        yield from render_on_cluster(settings.dask, asset, jobs, settings)
     elif jobs:
         with Renderer(asset, settings.threads, settings.march) as renderer:
             # a first frame, which compiles, or loads what was compiled before

@@ -40,6 +40,7 @@ from player.page.modules import joined, without_comments
 from player.page.poster import poster_bytes
 from player.page.scene_files import MANIFEST, scene_files
 from player.page.text_bytes import text_of_bytes
+from player.render import March
 
 INDEX = "index.html"
 STYLE = "style.css"
@@ -64,26 +65,40 @@ class WebPage(NamedTuple):
     """Bytes of graphics memory that the page will take."""
 
 
-def page(asset: Asset, title: str | None = None, max_gpu_mb: int = MAX_GPU_MB) -> bytes:
+def page(
+    asset: Asset,
+    title: str | None = None,
+    max_gpu_mb: int = MAX_GPU_MB,
+    n_threads: int | None = None,
+    march: March = "auto",
+) -> bytes:
     """Make one HTML file, in ASCII, which loads nothing else.
 
     Args:
         asset: an open asset, all of its parts.
         title: the page's title; the name of the asset's folder if None.
         max_gpu_mb: megabytes of graphics memory that the page may take.
+        n_threads, march: those of `player.render.render`, for the picture that the page shows at first.
 
     Raises:
         ConfigError: the page takes more graphics memory, or the asset has more channels than browsers can
             draw, or was opened without some of its parts.
         FormatError: a file of the asset is broken, or a part is missing.
+        MissingExtraError: `march` is "numba", which is not installed or does not run here.
 
     >>> page(Asset.open("out/"))[:15]
     b'<!doctype html>'
     """
-    return page_of_one_file(asset, title, max_gpu_mb).files[INDEX]
+    return page_of_one_file(asset, title, max_gpu_mb, n_threads, march).files[INDEX]
 
 
-def page_of_one_file(asset: Asset, title: str | None = None, max_gpu_mb: int = MAX_GPU_MB) -> WebPage:
+def page_of_one_file(
+    asset: Asset,
+    title: str | None = None,
+    max_gpu_mb: int = MAX_GPU_MB,
+    n_threads: int | None = None,
+    march: March = "auto",
+) -> WebPage:
     """Make the same file as `page`; returns it with its sizes."""
     n_gpu = _checked_gpu_bytes(asset, max_gpu_mb)
     sources = web_files()
@@ -97,7 +112,7 @@ def page_of_one_file(asset: Asset, title: str | None = None, max_gpu_mb: int = M
         connect="'none'",
     )
     viewer = text_of_bytes(packed).decode()
-    poster = base64.b64encode(poster_bytes(asset)).decode()
+    poster = base64.b64encode(poster_bytes(asset, n_threads, march)).decode()
     filled = {
         "policy": _policy_element(policy),
         "title": _title(asset, title),
@@ -113,7 +128,7 @@ def page_of_one_file(asset: Asset, title: str | None = None, max_gpu_mb: int = M
 
 def page_of_many_files(asset: Asset, title: str | None = None, max_gpu_mb: int = MAX_GPU_MB) -> WebPage:
     """Make the files of a folder for a web server. Its page, `index.html`, shows the scene as soon as the
-    first part is loaded. Arguments and errors are those of `page`.
+    first part is loaded. `title`, `max_gpu_mb` and the errors are those of `page`.
 
     >>> files = page_of_many_files(Asset.open("out/")).files
     >>> {"index.html", "main.js", "part_0.bin"} <= set(files)

@@ -7,15 +7,16 @@ import io
 from player.asset.asset import Asset
 from player.cameras.views import asset_cameras
 from player.page.rest import rest_camera
-from player.render import Renderer
+from player.render import March, Renderer
 
 LONGEST = 800
 """Most pixels of the longer side."""
 QUALITY = 85
 
 
-def poster_bytes(asset: Asset) -> bytes:
-    """Render a JPEG of the view that the page begins with, over the asset's background.
+def poster_bytes(asset: Asset, n_threads: int | None = None, march: March = "auto") -> bytes:
+    """Render a JPEG of the view that the page begins with, over the asset's background. `n_threads` and
+    `march` are those of `player.render.render`.
 
     >>> poster_bytes(Asset.open("out/"))[:3]
     b'\\xff\\xd8\\xff'
@@ -23,7 +24,7 @@ def poster_bytes(asset: Asset) -> bytes:
     from PIL import Image
 
     camera = rest_camera(asset_cameras(asset)).at_most(LONGEST)
-    with Renderer(asset) as renderer:
+    with Renderer(asset, n_threads, march) as renderer:
         frame = renderer.render(camera)
     buffer = io.BytesIO()
     Image.fromarray(frame.to_uint8()).save(buffer, "JPEG", quality=QUALITY, optimize=True, progressive=True)

@@ -49,6 +49,8 @@ class ServeSettings:
     """Threads that render; one for each core if None."""
     march: March = "auto"
     """Implementation: "numba", "numpy", or numba where it is there ("auto")."""
+    max_memory: float | None = None
+    """Gigabytes that an asset may take when it is opened for its page; half of the machine's if None."""
 
     def __post_init__(self) -> None:
         if self.background == "transparent":
@@ -97,7 +99,7 @@ def serve(
         renderers = [
             stack.enter_context(Renderer(first, settings.threads, settings.march)) for first in firsts
         ]
-        pages = Pages([partial(_page, first.folder) for first in firsts])
+        pages = Pages([partial(_page, first.folder, settings) for first in firsts])
         title = f"{printable(firsts[0].folder.resolve().name)} - vfr-play"
         server = guarded_server(settings.host, port, title, pages)
         windows: dict[int, Window] = {}
@@ -150,11 +152,12 @@ def guarded_server(host: str, port: int, title: str = "", pages: Pages = NO_PAGE
     return server
 
 
-def _page(folder: Path) -> bytes:
+def _page(folder: Path, settings: ServeSettings) -> bytes:
     """Make the page of an asset with all of its parts, even those that the viewer has not read yet."""
     from player.page.page import page
 
-    return page(Asset.open(folder))
+    asset = Asset.open(folder, max_memory=settings.max_memory)
+    return page(asset, n_threads=settings.threads, march=settings.march)
 
 
 def open_windows(

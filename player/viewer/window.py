@@ -212,8 +212,9 @@ class Window:
 
     def _screenshot(self) -> None:
         def picture() -> bytes:
+            layer = self._layer.value
             with self._whole:
-                return png_bytes(layer_picture(self._frame(self._camera()), self._layer.value))
+                return png_bytes(layer_picture(self._frame(self._camera(), layer), layer))
 
         self._send_file("screenshot.png", picture)
 
@@ -227,6 +228,9 @@ class Window:
             if not self._closed:
                 self._client.send_file_download(name, make(), save_immediately=True)
                 time.sleep(HANDED_OVER_SECONDS)
+        except Exception:
+            if not self._closed:  # else the renderer may be closed, too, which ends a picture midway: no bug
+                raise
         finally:
             self._saving.release()
 
@@ -267,11 +271,18 @@ class Window:
         width, height = fitted(min(width, MOST_SIDE), min(height, MOST_SIDE), MOST_PIXELS)
         return camera.resized(width, height)
 
-    def _frame(self, camera: Camera, moving: bool = False) -> Frame:
+    def _frame(self, camera: Camera, layer: str, moving: bool = False) -> Frame:
+        """Render a picture for `layer`; normals are computed at once, on all threads, if it shows them."""
         red, green, blue = (value / 255 for value in self._background.value)
         chosen = self._quality.value
         quality: Quality = chosen if chosen != QUALITIES[0] else "fast" if moving else "exact"
-        return self._renderer.render(camera, int(self._samples.value), (red, green, blue), quality=quality)
+        return self._renderer.render(
+            camera,
+            int(self._samples.value),
+            (red, green, blue),
+            layers=(layer == "normals"),
+            quality=quality,
+        )
 
     def _run(self) -> None:
         version = -1
@@ -284,7 +295,10 @@ class Window:
                 self._sharpen(version)
             except VfrError as error:
                 self._state.value = printable(str(error))
-            except Exception:  # a bug: it is reported, and does not end the window
+            except Exception:
+                if self._closed:  # the renderer may be closed, too, which ends a picture midway: no bug
+                    return
+                # a bug: it is reported, and does not end the window
                 threading.excepthook(threading.ExceptHookArgs((*sys.exc_info(), threading.current_thread())))
                 self._state.value = "failed: the terminal of vfr-play says why"
 
@@ -295,10 +309,10 @@ class Window:
             return self._version != version and not self._closed
 
     def _show_moving(self) -> None:
-        camera = self._camera()
+        camera, layer = self._camera(), self._layer.value
         start = time.perf_counter()
         small = camera.resized(*self._pace.moving(camera.width, camera.height))
-        picture = layer_picture(self._frame(small, moving=True), self._layer.value)
+        picture = layer_picture(self._frame(small, layer, moving=True), layer)
         seconds = time.perf_counter() - start
         self._pace.measured(small.width * small.height, seconds)
         self._send(picture, 75, f"{small.width}x{small.height}, {seconds * 1000:.0f} ms")
@@ -341,7 +355,8 @@ class Window:
             if self._closed or self._version != version:
                 return None
             strip = replace(camera, height=min(rows, camera.height - top), cy=camera.cy - top)
-            frames.append(self._frame(strip))
+            # without features: they are not shown, and could take more memory than all the rest
+            frames.append(replace(self._frame(strip, layer), features=None))
         return layer_picture(_joined(frames, layer), layer)
 
     def _send(self, picture: np.ndarray, quality: int, state: str) -> None:
@@ -365,7 +380,7 @@ def _named(renderers: Sequence[Renderer]) -> dict[str, Renderer]:
 
 
 def _joined(frames: Sequence[Frame], layer: str) -> Frame:
-    """Join strips, the uppermost first, to one frame; its normals are computed if `layer` shows them."""
+    """Join strips, the uppermost first, to one frame; it has normals if `layer` shows them."""
 
     def all_of(name: str) -> np.ndarray:
         return np.concatenate([getattr(frame, name) for frame in frames])

@@ -20,6 +20,7 @@ from vfr_bake.config import FieldConfig
 from vfr_bake.field.hash_grid import HashGrid
 from vfr_bake.field.networks import SphericalHarmonics
 from vfr_bake.kernels.contraction import contracted_unit
+from vfr_bake.kernels.hash_grid import corner_rows
 from vfr_bake.torch_kernels.hash_grid import encode
 from vfr_bake.torch_kernels.proposals import contracted_unit as contracted_torch
 
@@ -211,8 +212,10 @@ def test_hashes_past_2_to_the_31_are_those_of_whole_numbers() -> None:
     grid = small_grid(torch.float32, 4096)
     level = 2
     assert grid.layout.hashed[level]
+    first = int(grid.layout.offsets[level])
     for x, y, z in vertices:
-        wanted = (x ^ (y * 2654435761) ^ (z * 805459861)) % size
-        row = twins.rows_of(grid, torch.tensor([[x, y, z]]), level) - int(grid.layout.offsets[level])
-        HASH.holds(row.item() == wanted)
+        rows = corner_rows(x, y, z, 2**21, first, grid.layout.mask, True)
+        for corner, row in enumerate(rows):
+            a, b, c = x + (corner & 1), y + (corner >> 1 & 1), z + (corner >> 2 & 1)
+            HASH.holds(int(row) - first == (a ^ (b * 2654435761) ^ (c * 805459861)) % size)
         assert max(y * 2654435761, z * 805459861) < 2**63

@@ -42,6 +42,7 @@ SMALL = [
     *("--checkpoint-minutes", "0.001"),
 ]  # fmt: skip
 BAKE = ["--resolution", "24", "--refine-steps", "3", "--mesh-resolution", "16", "--check-views", "1"]
+N_PICTURES = 12
 PATIENCE = 300.0
 """Seconds after which a command counts as hanging."""
 
@@ -69,7 +70,7 @@ def commands(work: Path, names: list[str]) -> list[Command]:
     if "bake" in names and forked(lambda: train_main([str(data), str(model), *SMALL])) != 0:
         raise SystemExit("vfr-train failed")
     frames = work / "frames"
-    play = [str(asset), "--orbit", "12", "--size", "160x120", "--threads", "1", "--output", str(frames)]
+    play = [str(asset), *f"--orbit {N_PICTURES} --size 160x120 --threads 1 --output".split(), str(frames)]
     new_model, new_asset, mesh = work / "new.pt", work / "baked", work / "mesh.ply"
     every = [
         Command(
@@ -194,9 +195,13 @@ def kill_runs(every: list[Command], n_runs: int, seed: int) -> dict[str, Any]:
             again = ["--force"] if command.target.exists() and "--resume" not in command.again else []
             more = command.again if not over_old else ["--force"]
             code = forked(lambda c=command, m=(more or again): c.run([*c.arguments, *m]))
-            if code and not (code == 1 and after is not None and more == ["--resume"]):
+            is_trained = command.name == "train" and after is not None and more == ["--resume"]
+            if code and not (code == 1 and is_trained):  # a model that is there is not replaced
                 failures.append(f"{where}: exit code {code} when it is run again")
             command.check(command.target)
+            n_pictures = len(list(command.target.glob("[!.]*.png")))
+            if command.name == "play" and n_pictures != N_PICTURES:
+                failures.append(f"{where}: expected {N_PICTURES} pictures, got {n_pictures}")
         except Exception as error:
             failures.append(f"{where}: {type(error).__name__}: {error}")
     return {"usual_s": {k: round(v, 2) for k, v in usual.items()}, "killed": tally, "failures": failures}

@@ -96,7 +96,7 @@ def kind_as(settings: dict[str, Any]) -> SceneKind:
     >>> kind_as({"kind": "unbounded"}), kind_as({})
     ('unbounded', 'auto')
     """
-    kind = settings.get("kind")
+    kind: Any = settings.get("kind")
     return kind if kind in get_args(SceneKind) else "auto"
 
 

@@ -7,6 +7,7 @@ import io
 import json
 import os
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -250,6 +251,18 @@ def test_not_an_asset(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
     for option in (["--info"], ["--check"], ["--orbit", "1", "--output", str(tmp_path / "o")]):
         assert cli.main([str(tmp_path / "nowhere"), *option]) == 1
         assert "nowhere: expected the folder of an asset, got nothing" in capsys.readouterr().err
+
+
+def test_what_the_output_cannot_hold_is_escaped(
+    shells_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = Path(shutil.copytree(shells_folder, tmp_path / "b\u00e4r"))
+    for options in (["--info"], ["--view", "0", "--output", f"{folder}.png", "--march", "numpy"]):
+        written = io.BytesIO()
+        output = io.TextIOWrapper(written, encoding="ascii")
+        monkeypatch.setattr(sys, "stdout", output)
+        assert cli.main([str(folder), *options]) == 0
+        assert b"b\\xe4r" in written.getvalue()
 
 
 def test_full_disk(

@@ -7,12 +7,26 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import nullcontext
+from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+from weakref import WeakSet
 
 import pytest
 
 from player.app import cli
+from player.app import cluster as cluster_module
+from player.app.cluster import render_on_cluster
+from player.app.jobs import Done, Job
+from player.app.options import PlaySettings
+from player.asset.asset import Asset
+from player.cameras.camera import orbit
+from player.cameras.views import asset_cameras
+from player.errors import IntegrityError
+from tests.player.in_parts import write_in_parts
 
 REPOSITORY = Path(__file__).resolve().parents[3]
 N_FRAMES = 24
@@ -161,3 +175,60 @@ def test_without_the_extra(
     options = ["--orbit", "2", "--output", str(tmp_path / "o"), "--dask", "tcp://127.0.0.1:1"]
     assert cli.main([str(shells_folder), *options]) == 1
     assert "pip install 'vfr-bake[cluster]'" in capsys.readouterr().err
+
+
+# --- without a cluster ---
+
+
+class Task:
+    """A task of a cluster that this process stands in for; it runs when its result is asked for."""
+
+    def __init__(self, function: Callable[..., Done], *arguments: Any) -> None:
+        self.result = partial(function, *arguments)
+
+
+@pytest.fixture
+def tasks(monkeypatch: pytest.MonkeyPatch) -> Iterator[WeakSet[Task]]:
+    """Let this process stand in for a cluster; yield the tasks that the client still refers to."""
+    kept: WeakSet[Task] = WeakSet()
+
+    class Client(nullcontext):
+        def submit(self, function: Callable[..., Done], *arguments: Any, pure: bool) -> Task:
+            task = Task(function, *arguments)
+            kept.add(task)
+            return task
+
+    def wait(pending: list[Task], timeout: float, return_when: str) -> SimpleNamespace:
+        return SimpleNamespace(done={next(iter(pending))})
+
+    package = SimpleNamespace(Client=lambda address, timeout: Client(), wait=wait)
+    monkeypatch.setitem(sys.modules, "distributed", package)
+    yield kept
+    cluster_module._renderer.cache_clear()
+
+
+def rendered(asset: Asset, n_frames: int) -> Iterator[Done]:
+    """Render small frames of an asset on a cluster."""
+    cameras = orbit(asset_cameras(asset), n_frames, (16, 12))
+    jobs = [Job(n, camera, None, None, "exact", "key", ".png") for n, camera in enumerate(cameras)]
+    return render_on_cluster(
+        "tcp://127.0.0.1:1", asset, jobs, PlaySettings(Path("o"), threads=1, march="numpy")
+    )
+
+
+def test_workers_need_not_keep_frames_that_have_arrived(asset: Asset, tasks: WeakSet[Task]) -> None:
+    """A worker keeps a frame for as long as the client refers to its task."""
+    assert [len(tasks) for _ in rendered(asset, 3)] == [3, 2, 1]
+
+
+def test_a_worker_with_an_incomplete_copy_is_refused(tasks: WeakSet[Task], tmp_path: Path) -> None:
+    """A worker with fewer parts is refused; once its copy is whole, the same worker renders."""
+    asset = Asset.open(write_in_parts(tmp_path / "asset"))
+    last = asset.folder / f"part_{asset.n_parts - 1}.bin"
+    content = last.read_bytes()
+    last.unlink()
+    message = f"on a worker: parts: expected {asset.n_parts} as on the client, got {asset.n_parts - 1}: "
+    with pytest.raises(IntegrityError, match=message):
+        list(rendered(asset, 1))
+    last.write_bytes(content)
+    assert [frame.index for frame in rendered(asset, 1)] == [0]

@@ -33,9 +33,13 @@ def test_a_folder_of_that_name_is_another_asset(
     assert said[0] != said[1]
 
 
-@pytest.mark.parametrize("display", ["", ":0"])
+@pytest.mark.parametrize(("options", "display"), [([], ""), (["--max-memory", "4"], ":0")])
 def test_without_the_viewer_its_page_opens(
-    display: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    options: list[str],
+    display: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     opened: list[str] = []
     monkeypatch.setitem(sys.modules, "viser", None)
@@ -44,10 +48,23 @@ def test_without_the_viewer_its_page_opens(
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     monkeypatch.setattr(webbrowser, "open", opened.append)
-    assert cli.main(["demo"]) == 0
+    assert cli.main(["demo", *options]) == 0
     (written,) = tmp_path.glob("*/demo.html")
     assert written.read_bytes() == page(Asset.open(DEMO))
     assert opened == ([written.as_uri()] if display else [])
     said = capsys.readouterr()
     assert said.out == f"{written}: open it in any browser\n"
     assert "pip install 'vfr-bake[viewer]'" in said.err
+
+
+def test_what_its_page_cannot_do_needs_the_viewer(
+    shells_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "viser", None)
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    monkeypatch.setattr(webbrowser, "open", lambda address: None)
+    for more in (["--threads", "1"], ["--background", "black"], ["--port", "8123"], [str(shells_folder)]):
+        assert cli.main(["demo", *more]) == 1
+        said = capsys.readouterr()
+        assert said.out == "" and "expected the package viser, which is not installed" in said.err
+    assert not list(tmp_path.glob("*/demo.html"))

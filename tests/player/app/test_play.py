@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+import weakref
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -19,6 +20,7 @@ import pytest
 from PIL import Image
 
 from player.app import cli
+from player.app.jobs import Done, Job, render_job
 from player.app.options import PlaySettings
 from player.app.play import LARGE_BYTES, _check_sizes, play
 from player.app.video import write_video
@@ -31,6 +33,7 @@ from player.errors import ConfigError, OutputError
 from player.files.images import png_bytes, read_key, webp_bytes
 from player.march.interpolation import Quality
 from player.render import FRAME_BYTES, Renderer, render
+from tests.player.in_parts import write_in_parts
 
 REPOSITORY = Path(__file__).resolve().parents[3]
 
@@ -144,6 +147,25 @@ def test_keys_survive_in_both_formats(tmp_path: Path) -> None:
         webp_bytes(np.zeros((1, 16384, 3), np.uint8))
 
 
+def test_the_file_of_one_frame_is_in_memory_at_a_time(
+    asset: Asset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made: list[weakref.ref[Done]] = []
+    n_kept: list[int] = []
+
+    def remembered(renderer: Renderer, job: Job) -> Done:
+        done = render_job(renderer, job)
+        made.append(weakref.ref(done))
+        return done
+
+    def count(*_: float) -> None:
+        n_kept.append(sum(done() is not None for done in made))
+
+    monkeypatch.setattr("player.app.play.render_job", remembered)
+    played = play(asset, asset_cameras(asset), PlaySettings(tmp_path / "o", march="numpy"), advance=count)
+    assert n_kept == [1] * 5 and played.figures["frames"] == 5
+
+
 # --- resume ---
 
 
@@ -189,6 +211,19 @@ def test_resume_replaces_no_stranger(
     assert cli.main([*trained(shells_folder), "--output", str(out), "--resume"]) == 1
     assert "r_1.png: --resume: expected a frame" in capsys.readouterr().err
     assert (out / "r_1.png").read_text() == "mine" and len(list(out.iterdir())) == 1
+
+
+def test_resume_does_not_mix_an_incomplete_copy_with_the_whole_asset(tmp_path: Path) -> None:
+    folder = write_in_parts(tmp_path / "asset")
+    some, whole = Asset.open(folder, parts=1), Asset.open(folder)
+    cameras = [camera.resized(24, 20) for camera in asset_cameras(whole)[:2]]
+    settings = PlaySettings(tmp_path / "o", march="numpy")
+    again = replace(settings, resume=True)
+    for first, second in ((some, whole), (whole, some)):
+        play(first, cameras, replace(settings, force=True))
+        assert play(first, cameras, again).n_kept == 2
+        with pytest.raises(ConfigError, match="--resume: expected a frame of this asset"):
+            play(second, cameras, again)
 
 
 @pytest.mark.parametrize("name", ["frames", pytest.param("turn.mp4", marks=pytest.mark.extra)])
@@ -262,6 +297,10 @@ def test_a_video_shows_the_frames_at_the_paths_rate(
             # colour at half resolution loses noise of single pixels; the mean shows that colours are right
             assert np.abs(decoded[:49, :65] - picture).mean() < 8
             assert np.abs(decoded[:49, :65].mean(axis=(0, 1)) - picture.mean(axis=(0, 1))).max() < 2.5
+    again = ["--cameras", str(path), "--output", str(target), "--fps", "7", "--force"]
+    assert cli.main([str(shells_folder), *again]) == 0
+    with av.open(str(target)) as container:
+        assert float(container.streams.video[0].average_rate or 0) == 7
     assert sorted(p.name for p in tmp_path.iterdir()) == ["path.json", "turn.mp4"]
 
 

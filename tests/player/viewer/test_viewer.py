@@ -6,10 +6,13 @@ import io
 import shutil
 import socket
 import sys
+import threading
 import time
 import urllib.request
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 from urllib.error import URLError
 
 import numpy as np
@@ -19,12 +22,17 @@ from playwright.sync_api import Browser, Page, sync_playwright
 
 from player.app import cli
 from player.asset.asset import Asset
+from player.cameras.camera import Camera
 from player.cameras.transforms import read_cameras
 from player.errors import ConfigError
+from player.march.bounds import BLOCK
+from player.march.normals import composited_normals
 from player.render import Renderer
+from player.viewer import window as window_module
 from player.viewer.layers import LAYERS, layer_picture
 from player.viewer.resolution import FRAME_SECONDS, LEAST, SHARE, SHARP_SECONDS, STILL_SECONDS, Pace, fitted
 from player.viewer.server import ServeSettings, free_port, serve
+from player.viewer.window import Window
 from tests.player.conftest import write_shells
 from tests.player.viewer.viewer_client import SECONDS, Server
 
@@ -146,6 +154,78 @@ def test_a_program_serves_as_the_command_does(asset: Asset, capfd: pytest.Captur
         with pytest.raises(URLError):
             urllib.request.urlopen(address)
     assert capfd.readouterr() == ("", "")
+
+
+# --- windows without a client ---
+
+
+def window_of(renderer: Renderer, camera: Camera, layer: str, sent: list[str]) -> Window:
+    """Return a window whose camera stands still; the names of the files that it sends are added to `sent`."""
+    window: Any = Window.__new__(Window)
+    window._renderer, window._pace, window._camera = renderer, Pace(), lambda: camera
+    window._version, window._closed, window._changed = 0, False, threading.Condition()
+    window._whole, window._saving = threading.Lock(), threading.Lock()
+    window._connection = SimpleNamespace(n_sending=0)
+    window._client = SimpleNamespace(
+        scene=SimpleNamespace(set_background_image=lambda picture, **_: None),
+        send_file_download=lambda name, content, **_: sent.append(name),
+    )
+    white = (255, 255, 255)
+    values = {"layer": layer, "samples": 5, "quality": "exact", "background": white, "state": ""}
+    vars(window).update({f"_{name}": SimpleNamespace(value=value) for name, value in values.items()})
+    return window
+
+
+def test_normals_are_rendered_as_other_layers_are(asset: Asset, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The renderer's threads compute normals, strip by strip, and they are given up if something changes."""
+    camera, names, sent = read_cameras(asset.path("cameras.json"))[0].resized(96, 80), [], []
+    monkeypatch.setattr(window_module, "STRIP_PIXELS", camera.width * BLOCK)
+    with Renderer(asset, 2, "numpy") as renderer:
+        window = window_of(renderer, camera, "normals", sent)
+
+        def change(*arguments: Any) -> np.ndarray:
+            names.append(threading.current_thread().name)
+            window.touch()
+            return composited_normals(*arguments)
+
+        monkeypatch.setattr("player.render.composited_normals", change)
+        assert window._in_strips(camera, 0) is None
+        for render in (window._show_moving, window._screenshot):
+            n_before = len(names)
+            render()
+            assert len(names) > n_before
+    assert all(name.startswith("vfr-play") for name in names) and sent == ["screenshot.png"]
+
+
+@pytest.mark.parametrize("closed", [False, True])
+def test_a_picture_that_ends_with_its_window_is_no_bug(
+    closed: bool, asset: Asset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Ctrl-C closes windows and then renderers, also in the middle of a picture, which then fails. The same
+    error in a window that is open is a bug, and is reported."""
+    camera, reported, sent = read_cameras(asset.path("cameras.json"))[0], [], []
+    with Renderer(asset, 1, "numpy") as renderer:
+        window = window_of(renderer, camera, "colour", sent)
+
+    def interrupted() -> Camera:
+        window._closed = closed
+        return camera
+
+    def report(arguments: Any) -> None:
+        reported.append(arguments.exc_type)
+        window.close()
+
+    monkeypatch.setattr(window, "_camera", interrupted)
+    monkeypatch.setattr(threading, "excepthook", report)
+    window._run()
+    assert reported == ([] if closed else [RuntimeError])
+    window._closed = False
+    if closed:
+        window._screenshot()
+    else:
+        with pytest.raises(RuntimeError):
+            window._screenshot()
+    assert not sent
 
 
 # --- in a browser ---

@@ -16,10 +16,13 @@ import viser
 from websockets.datastructures import Headers
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
+from player.asset.asset import Asset
 from player.errors import MissingExtraError
+from player.render import Renderer
 from player.viewer import guard, messages
 from player.viewer.guard import MOST_CLIENTS, MOST_SOCKETS, Guard
-from player.viewer.server import free_port, guarded_server
+from player.viewer.messages import colour, one_of, pressed, within
+from player.viewer.server import ServeSettings, free_port, guarded_server, serve
 from player.viewer.window import MOST_PIXELS, MOST_SIDE
 from tests.player.conftest import write_shells
 from tests.player.viewer.viewer_client import CAMERA, SECONDS, Client, Server, get, opened, still_serves
@@ -132,7 +135,10 @@ def test_a_viser_that_cannot_be_guarded_serves_nothing(monkeypatch: pytest.Monke
 
 
 def test_a_client_cannot_open_a_way_in_from_the_internet(server: Server) -> None:
-    """A client cannot open a tunnel, which would be announced on the terminal and to the client."""
+    """A client cannot open a tunnel, which would be announced on the terminal and to the client. The messages
+    that ask for it are not passed on."""
+    for kind in ("ShareUrlRequest", "ShareUrlDisconnect"):
+        assert messages.cleaned(msgspec.msgpack.encode({"type": kind}), {}) is None
     with Client(server) as client:
         client.move()
         client.picture()
@@ -177,6 +183,60 @@ BAD_CAMERAS: list[dict[str, Any]] = [
 ]
 
 
+@pytest.mark.parametrize("changes", BAD_CAMERAS, ids=str)
+def test_a_camera_that_is_none_is_not_passed_on(changes: dict[str, Any]) -> None:
+    assert messages.cleaned(msgspec.msgpack.encode(CAMERA), {}) is not None
+    assert messages.cleaned(msgspec.msgpack.encode(CAMERA | changes), {}) is None
+
+
+BAD_VALUES = [NAN, INF, -INF, -5, 1e300, 1 << 63, "x", "9" * 1000, None, [], [1, 2], [NAN] * 3, {}, True]
+
+
+@pytest.mark.parametrize(
+    ("check", "taken"),
+    [
+        (within(lambda: (0, 16), whole=True), [16, 0, 0, 16, 16]),
+        (one_of(("colour", "opacity")), []),
+        (colour, []),
+        (pressed, [True]),
+    ],
+    ids=["number", "choice", "colour", "button"],
+)
+def test_a_control_is_passed_only_what_it_takes(check: Any, taken: list[Any]) -> None:
+    """Numbers out of range are passed as the nearest that is in it; everything else that does not fit is
+    dropped."""
+    sent = [{"type": "GuiUpdateMessage", "uuid": "a", "updates": {"value": value}} for value in BAD_VALUES]
+    passed = [messages.cleaned(msgspec.msgpack.encode(one), {"a": check}) for one in sent]
+    assert [msgspec.msgpack.decode(one)["updates"]["value"] for one in passed if one] == taken
+
+
+def test_controls_begin_as_the_command_line_says(shells_folder: Path, tmp_path: Path) -> None:
+    options = ["--samples", "3", "--quality", "high", "--background", "10,200,30", "--march", "numpy"]
+    server = Server(tmp_path / "errors.txt", shells_folder, *options)
+    with Client(server) as client:
+        client.move()
+        found = {
+            message["props"]["label"]: message["value"]
+            for message in client.messages(3)
+            if "value" in message and "label" in message.get("props", {})
+        }
+    assert server.stop() == 130
+    assert [found[name] for name in ("Fetches", "Quality", "Background")] == [3, "high", [10, 200, 30]]
+
+
+def test_the_viewer_renders_as_it_was_told(shells_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[tuple[Any, ...]] = []
+
+    def made(*given: Any) -> Renderer:
+        seen.append(given[1:])
+        return Renderer(*given)
+
+    monkeypatch.setattr("player.viewer.server.Renderer", made)
+    with serve(Asset.open(shells_folder), ServeSettings(threads=1, march="numpy")):
+        pass
+    assert seen == [(1, "numpy")]
+
+
 @pytest.mark.parametrize("first", [True, False])
 def test_a_camera_that_is_none_is_ignored(first: bool, server: Server) -> None:
     """An invalid camera is ignored, whether it is a client's first or a later one; the next one is used."""
@@ -197,9 +257,8 @@ def test_controls_take_what_they_offer_alone(server: Server) -> None:
         client.move()
         client.picture()
         list(client.messages(1))
-        bad = [NAN, INF, -INF, -5, 1e300, 1 << 63, "x", "9" * 1000, None, [], [1, 2], [NAN] * 3, {}, True]
         for label in client.controls:
-            for value in bad:
+            for value in BAD_VALUES:
                 client.set(label, value)
             for name in ("update_cb", "removed", "sync_cb", "props", "uuid", "gui_api", "x"):
                 client.send(

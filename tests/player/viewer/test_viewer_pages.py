@@ -15,9 +15,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from player.asset.asset import Asset
 from player.errors import ConfigError, FormatError
+from player.render import March, Renderer
 from player.viewer import pages
-from player.viewer.server import free_port, guarded_server
+from player.viewer.server import ServeSettings, free_port, guarded_server, serve
 from tests.player.page.viewer_page import chromium
 from tests.player.viewer.viewer_client import SECONDS, Server
 
@@ -183,6 +185,25 @@ def test_a_server_that_stops_waits_for_nobody() -> None:
         begin = time.monotonic()
     assert time.monotonic() - begin < 3
     slow.close()
+
+
+def test_a_page_is_made_with_the_settings_of_the_viewer(
+    asset: Asset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The page's first picture is rendered with the viewer's threads and march, within its memory."""
+    seen: list[tuple[int | None, March]] = []
+
+    def renderer(asset: Asset, n_threads: int | None = None, march: March = "auto") -> Renderer:
+        seen.append((n_threads, march))
+        return Renderer(asset, n_threads, march)
+
+    monkeypatch.setattr("player.page.poster.Renderer", renderer)
+    with serve(asset, ServeSettings(threads=1, march="numpy")) as address:
+        assert got(int(address.rpartition(":")[2]))[0] == 200
+    assert seen == [(1, "numpy")]
+    with serve(asset, ServeSettings(march="numpy", max_memory=1e-6)) as address:
+        status, _, body = got(int(address.rpartition(":")[2]))
+    assert status == 503 and b"memory: expected at most 1e-06 GB" in body
 
 
 def test_the_viewer_has_a_link_to_the_page(shells_folder: Path, tmp_path: Path) -> None:

@@ -22,11 +22,11 @@ def as_srgb(rgba: np.ndarray, profile: object) -> np.ndarray:
     >>> as_srgb(np.full((1, 1, 4), 9, np.uint8), b"no profile").tolist()
     [[[9, 9, 9, 9]]]
     """
-    if not isinstance(profile, bytes) or not profile:
+    if not isinstance(profile, bytes) or profile[16:20] != b"RGB ":
         return rgba
     try:
         own = ImageCms.ImageCmsProfile(io.BytesIO(profile))
-        if own.profile.xcolor_space.strip() != "RGB" or "sRGB" in ImageCms.getProfileDescription(own):
+        if "sRGB" in ImageCms.getProfileDescription(own):
             return rgba
         colours = ImageCms.profileToProfile(
             Image.fromarray(np.ascontiguousarray(rgba[..., :3])),
