@@ -197,11 +197,11 @@ def _with_cameras(data: str) -> str:
         data = str(folder)
     if not needs_cameras(data):
         if added := added_since(folder):
+            named = ", ".join(added[:3]) + (", ..." if len(added) > 3 else "")
             _say(
                 data,
-                f"{len(added)} pictures were added after the cameras were estimated, and are not used "
-                f"({printable(', '.join(added[:3]))}{', ...' if len(added) > 3 else ''}): remove "
-                f"{folder / 'sparse'} to use them",
+                f"pictures that were added after the cameras were estimated are not used: {len(added)} "
+                f"({named}): remove {folder / 'sparse'} to use them",
             )
         return data
     with Bars() as bars:
@@ -343,12 +343,11 @@ def _test_figures(model: Model, scene: Scene, n_views: int) -> dict[str, Any]:
         for score in evaluate(model, scene.test, n_views, masked=scene.masked):
             scores.append(score.psnr)
             bar.count(len(scores), n_views)
-    figures = {
-        "test_psnr": float(np.mean(scores)),
+    return {
+        **_finite({"test_psnr": float(np.mean(scores))}),
         "test_views": len(scores),
         "background": model.background.tolist(),
     }
-    return _finite(figures)
 
 
 def _bake(options: Any) -> int:
@@ -428,7 +427,7 @@ def _eval(options: Any) -> int:
 
     from player.cameras.transforms import frame_names
     from player.files.images import write_png
-    from vfr_bake.data import kind_as, load_scene, reader_as
+    from vfr_bake.data import load_scene_as
     from vfr_bake.training.model_file import load_model
     from vfr_bake.training.scores.evaluation import render_views
     from vfr_bake.training.scores.lpips import Lpips
@@ -437,13 +436,7 @@ def _eval(options: Any) -> int:
     lpips = None if options.lpips is None else Lpips(options.lpips)
     model = load_model(options.model, options.max_memory)
     with Bar("reading pictures") as bar:
-        scene = load_scene(
-            options.data,
-            bar.count,
-            kind=kind_as(model.train),
-            scale=model.train.get("scale"),
-            reader=reader_as(model.train),
-        )
+        scene = load_scene_as(model.train, options.data, bar.count)
     if not scene.test.cameras:
         raise DataError(f"{options.data}: test views: expected at least 1, got none")
     to_model = np.linalg.inv(model.world_from_model)

@@ -145,7 +145,7 @@ def _summary(
     play: dict[str, Any],
 ) -> str:
     """Return lines that say where the results are and how good; `seconds` and figures are the commands'."""
-    full = f", full model {train['test_psnr']:.2f} dB" if "test_psnr" in train else ""
+    full = f", full model {train['test_psnr']:.2f} dB" if train.get("test_psnr") is not None else ""
     return (
         f"\npictures   {output / 'frames'} ({play['frames']} frames)\n"
         f"           {output / 'side_by_side.png'} (the scene's own pictures above, played below)\n"

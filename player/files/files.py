@@ -142,12 +142,12 @@ def _takes_files(folder: Path) -> bool:
     """Return whether files can be made in `folder`. Windows only tells if one is made."""
     if sys.platform != "win32":
         return os.access(folder, os.W_OK)
+    probe = _temporary_name(folder / "probe")
     try:
-        probe = _temporary_name(folder / "probe")
         probe.touch()
-        probe.unlink()
     except OSError:
         return False
+    remove(probe)
     return True
 
 

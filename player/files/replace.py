@@ -37,7 +37,7 @@ from player.errors import OutputError
 PART = ".part"
 PAUSES = (0.05, 0.1, 0.2, 0.5, 1.0, 2.0)
 """Seconds between the tries to rename a file that another program has open, on Windows."""
-_PARTS = re.compile(r"\..+\.[a-z0-9_]{8}\.part", re.DOTALL)  # names as tempfile makes them
+_PARTS = re.compile(r"\..+\.[a-z0-9_]{8}\.part", re.DOTALL)  # 8 characters, as `tempfile` makes them, too
 _TOGETHER = re.compile(r"\.(.+)\.together", re.DOTALL)
 _REPLACED = re.compile(r"\.(.+)\.replaced", re.DOTALL)
 _NO_SYNC = (errno.EINVAL, errno.ENOTSUP, errno.EBADF)  # errors of a disk that cannot sync a folder
@@ -152,8 +152,8 @@ def exchange(one: Path, other: Path) -> bool:
     names = os.fsencode(one), os.fsencode(other)
     try:
         if sys.platform == "linux":
-            rename = ctypes.CDLL(None).renameat2
-            return rename(_AT_FDCWD, names[0], _AT_FDCWD, names[1], _RENAME_EXCHANGE) == 0
+            swap = ctypes.CDLL(None).renameat2
+            return swap(_AT_FDCWD, names[0], _AT_FDCWD, names[1], _RENAME_EXCHANGE) == 0
         if sys.platform == "darwin":
             return ctypes.CDLL(None).renamex_np(*names, _RENAME_SWAP) == 0
     except AttributeError:  # an old system
@@ -197,7 +197,7 @@ def move_out(folder: Path) -> None:
     for path in sorted(folder.iterdir()):
         if path.name.split(".")[0] == together[1].split(".")[0] and path.is_file() and not path.is_symlink():
             with suppress(FileNotFoundError):
-                path.replace(folder.parent / path.name)
+                rename(path, folder.parent / path.name)
     with suppress(OSError):
         folder.rmdir()
 

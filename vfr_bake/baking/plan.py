@@ -95,8 +95,9 @@ COMPILE_SECONDS = 45.0
 bake of `make demo` with AVX-512, and a minute without."""
 
 CULLING_BYTES = 8
-"""Bytes that each cell of a box takes while cells are left out, beside a mark for each floor: those that may
-hold matter, those that weigh enough, their neighbours, and distances to them."""
+"""Bytes that each cell of a box takes while it is decided which cells are left out: marks of the cells that
+may hold matter, of those that weigh enough and of their neighbours, and distances to them. A byte for each
+weight floor is added."""
 
 
 @dataclass(frozen=True)
@@ -195,10 +196,9 @@ def _resolutions(model: Model, config: BakeConfig) -> Resolutions:
 
 def _marks_bytes(model: Model, config: BakeConfig) -> float:
     """Return the bytes that each cell of the features' grid takes while the stored cells are found."""
-    unbounded = model.field.config.unbounded
-    n_floors = len(FLOORS) if config.weight_floor is None and not unbounded else 1
-    if unbounded:
-        return (4 + (0 if config.no_cull else n_floors)) / BLOCK**3
+    if model.field.config.unbounded:
+        return (4 if config.no_cull else 5) / BLOCK**3
+    n_floors = len(FLOORS) if config.weight_floor is None else 1
     return 4 if config.no_cull else CULLING_BYTES + n_floors
 
 

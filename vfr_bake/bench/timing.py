@@ -78,7 +78,7 @@ def measure_times(
     """Return the times of every (player, dials, size); each of `players` is a function that asks
     one process for a frame.
 
-    There are `n_rounds` rounds, or as many as are expected to end before `until`, which is compared with
+    There are `n_rounds` rounds, or fewer if not all are expected to end before `until`, a time of the clock
     `time.monotonic()`; but at least FEWEST_ROUNDS.
     """
     random = np.random.default_rng(SEED)
@@ -97,7 +97,8 @@ def measure_times(
             done += 1
             progress(done, n_rounds * len(places))
         turn += 1
-        a_round = (time.monotonic() - begin) / turn
+        # Not 0: the resolution of some clocks is only 16 ms.
+        a_round = max(time.monotonic() - begin, 1e-9) / turn
         n_rounds = int(min(n_rounds, max((until - begin) / a_round, FEWEST_ROUNDS)))
     times = {}
     for (player, size), rounds in visits.items():

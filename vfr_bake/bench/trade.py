@@ -32,7 +32,7 @@ from vfr_bake.bench.result import Setting, Trade, conclude
 from vfr_bake.bench.timing import Dials, Size, frame_times, measure_times
 from vfr_bake.bench.worst import WorstPixel, worst_pixels
 from vfr_bake.config import BenchConfig
-from vfr_bake.data import kind_as, load_scene, reader_as
+from vfr_bake.data import load_scene_as
 from vfr_bake.training.scores.evaluation import RenderedView, beside_photograph
 from vfr_bake.training.scores.metrics import Distance, mean_scores, psnr, ssim
 
@@ -292,13 +292,7 @@ def played_bytes(asset: Asset) -> int:
 
 def _read_views(config: BenchConfig, assets: list[Asset], progress: Report) -> Views:
     train = assets[0].manifest.provenance.get("train", {})
-    scene = load_scene(
-        config.data,
-        lambda done, of: progress("reading pictures", done, of),
-        kind=kind_as(train),
-        scale=train.get("scale"),
-        reader=reader_as(train),
-    )
+    scene = load_scene_as(train, config.data, lambda done, of: progress("reading pictures", done, of))
     if not scene.test.cameras:
         raise DataError(f"{config.data}: test views: expected at least 1, got none")
     n_views = min(config.views, len(scene.test.cameras))

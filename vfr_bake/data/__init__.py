@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 from player.cameras.colmap import colmap_folder
 from player.progress import Progress
 from vfr_bake.config import SceneKind, TrainConfig
 from vfr_bake.data.demo import demo_capture
 from vfr_bake.data.files.archives import is_archive, unpack
+from vfr_bake.data.files.source import check_source
 from vfr_bake.data.files.video import frames_folder
 from vfr_bake.data.folders import has_transforms, load_folder
 from vfr_bake.data.poses import has_pictures, is_video
@@ -23,8 +24,8 @@ from vfr_bake.data.world import scaled
 __all__ = [
     "PosedImages",
     "Scene",
-    "kind_as",
     "load_scene",
+    "load_scene_as",
     "needs_cameras",
     "reader_as",
     "training_reader",
@@ -61,7 +62,10 @@ def load_scene(
         capture = replace(capture, train=train, test=test)
     else:
         folder = unpacked(data)
-        capture = load_folder(frames_folder(folder) if is_video(folder) else folder, progress, reader)
+        if is_video(folder):
+            check_source(frames_folder(folder), folder)
+            folder = frames_folder(folder)
+        capture = load_folder(folder, progress, reader)
     if scale is not None:
         capture = scaled(capture, *scale)
     return build_scene(capture, kind)
@@ -89,15 +93,14 @@ def reader_as(settings: dict[str, Any]) -> PictureReader:
     return PictureReader(size, on_disk=True)
 
 
-def kind_as(settings: dict[str, Any]) -> SceneKind:
-    """Return the kind of scene that was asked for in a training with these `settings`, as they are recorded
-    in a model or an asset: it decides whether transparent pixels are masked.
-
-    >>> kind_as({"kind": "unbounded"}), kind_as({})
-    ('unbounded', 'auto')
-    """
-    kind: Any = settings.get("kind")
-    return kind if kind in get_args(SceneKind) else "auto"
+def load_scene_as(settings: dict[str, Any], data: str | Path, progress: Progress | None = None) -> Scene:
+    """Load the pictures that `data` names in the way in which a training with these `settings` loaded them:
+    reduced to the same size, in the same unit, and with transparent pixels masked if the scene was trained as
+    an unbounded one. Models and assets record these settings. The other arguments and the errors are those of
+    `load_scene`."""
+    kind: SceneKind = "unbounded" if settings.get("kind") == "unbounded" else "auto"
+    reader = reader_as(settings)
+    return load_scene(data, progress, kind=kind, scale=settings.get("scale"), reader=reader)
 
 
 def unpacked(data: str | Path, progress: Progress | None = None) -> Path:

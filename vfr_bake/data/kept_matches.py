@@ -165,13 +165,13 @@ class KeptMatches:
         self._append(self._matches_path, self._matches, a + b, record)
 
     def _at(self, path: Path, index: dict[bytes, int], key: bytes) -> BinaryIO | None:
-        """Open a file at the record of `key`; None if there is no such record, or another process, which is
-        done with the same pictures, has deleted the file."""
+        """Open a file at the record of `key`; None if there is no such record, or the file cannot be opened,
+        for example because another process, which is done with the same pictures, has deleted it."""
         if key not in index:
             return None
         try:
             file = path.open("rb")
-        except FileNotFoundError:
+        except OSError:
             return None
         file.seek(index[key])
         return file

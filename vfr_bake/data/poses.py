@@ -208,11 +208,10 @@ def estimate_cameras(
     placed = _names_in(models[0])
     apart = tuple(n for other in models[1:] if (n := len(_names_in(other) - placed)) >= MIN_PICTURES)
     reasons = why_unplaced(names, features, pairs, models)
-    if model.exists():  # another process was faster
-        return _read_report(model, photos, len(pictures))
-    with new_folder(model) as new:
-        models[0].write_binary(str(new))
-        write_record(new, EstimateRecord(True, left_out, reasons, apart))
+    if not model.exists():  # another process may have been faster
+        with new_folder(model) as new:
+            models[0].write_binary(str(new))
+            write_record(new, EstimateRecord(True, left_out, reasons, apart))
     known.remove()
     return _read_report(model, photos, len(pictures))
 

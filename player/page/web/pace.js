@@ -26,11 +26,11 @@ export class Pace {
 
   // Adapt to the seconds that a picture took while the camera moved. Times are whole frames of the screen. So the next
   // picture is smaller after a time clearly above the target, somewhat larger after one well below it, and else the same.
-  // `atOnce`: whether the picture was finished by the screen's next frame. A screen of 50 frames a second or fewer cannot tell
-  // shorter times, so there a picture may be well below the target although its measured time is not.
+  // `atOnce`: whether the picture was finished by the screen's next frame. A screen of 50 frames a second cannot tell shorter
+  // times, so there a picture may be well below the target although its measured time is not.
   measured(pixels, seconds, atOnce) {
     this.rate = pixels / Math.max(seconds, 1e-4);
-    const fast = (atOnce ? 1.05 : 0.6) * FRAME_SECONDS;
+    const fast = (atOnce ? 0.8 : 0.6) * FRAME_SECONDS;
     if (seconds > 1.2 * FRAME_SECONDS) this.pixels = pixels * Math.max(0.5, 0.9 * FRAME_SECONDS / seconds);
     else if (seconds < fast && pixels > 0.9 * this.pixels) this.pixels = 1.2 * pixels;
     this.pixels = Math.min(Math.max(this.pixels, LEAST), MOST);

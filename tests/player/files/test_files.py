@@ -156,7 +156,7 @@ def test_a_failure_midway_leaves_the_old_file(
     path = tmp_path / "file.bin"
     path.write_bytes(b"old content")
     if step == "write":
-        monkeypatch.setattr(Path, "open", lambda path, mode: FullDisk(path, mode))
+        monkeypatch.setattr(Path, "open", lambda path, mode, **_: FullDisk(path, mode))
     elif step == "fsync":
         monkeypatch.setattr(os, "fsync", refuse(errno.ENOSPC))
     else:
@@ -180,7 +180,7 @@ def test_an_interrupt_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.Mo
 
 
 def test_a_failure_leaves_nothing_where_nothing_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Path, "open", lambda path, mode: FullDisk(path, mode))
+    monkeypatch.setattr(Path, "open", lambda path, mode, **_: FullDisk(path, mode))
     with pytest.raises(OutputError, match=FULL):
         write_bytes(tmp_path / "file.bin", b"new content")
     assert names(tmp_path) == []
@@ -319,7 +319,7 @@ def test_new_folder_in_a_read_only_folder(read_only: Path) -> None:
 
 @pytest.mark.parametrize("mask", [0o000, 0o022, 0o027, 0o077])
 def test_permissions_are_those_of_anything_new(mask: int, tmp_path: Path) -> None:
-    """Files and folders get the permissions that `open` and `mkdir` give; temporary ones are private."""
+    """Files and folders get the permissions that `open` and `mkdir` give."""
     with umask(mask):
         (tmp_path / "plain").write_bytes(b"")
         (tmp_path / "plain folder").mkdir()

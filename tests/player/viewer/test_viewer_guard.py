@@ -207,7 +207,7 @@ def test_a_control_is_passed_only_what_it_takes(check: Any, taken: list[Any]) ->
     dropped."""
     sent = [{"type": "GuiUpdateMessage", "uuid": "a", "updates": {"value": value}} for value in BAD_VALUES]
     passed = [messages.cleaned(msgspec.msgpack.encode(one), {"a": check}) for one in sent]
-    assert [msgspec.msgpack.decode(one)["updates"]["value"] for one in passed if one] == taken
+    assert [msgspec.msgpack.decode(one[1])["updates"]["value"] for one in passed if one] == taken
 
 
 def test_controls_begin_as_the_command_line_says(shells_folder: Path, tmp_path: Path) -> None:

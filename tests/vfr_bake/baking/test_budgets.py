@@ -13,6 +13,7 @@ import pytest
 
 from exporters.formats.ply import read_ply
 from player.asset.asset import Asset
+from player.cameras.camera import Camera
 from player.errors import ConfigError, TrainingError
 from player.kept_code import is_kept
 from player.page.gpu_memory import TILE, gpu_bytes
@@ -26,6 +27,7 @@ from vfr_bake.baking.mesh import bake_mesh
 from vfr_bake.baking.plan import (
     CHOSEN_COST,
     COMPILE_SECONDS,
+    CULLING_BYTES,
     FEW_DRAWN,
     FEWEST_RAYS,
     HEAD_COST,
@@ -171,7 +173,7 @@ def test_a_grid_that_memory_limits_is_not_refused(
     monkeypatch.setattr("vfr_bake.baking.plan.FEWEST_RAYS", 1)
     wanted = make_plan(model, BakeConfig(preset=preset)).resolutions
     for n_cells in np.linspace(10, wanted.features - 1, 80):
-        gigabytes = (PROGRAM_BYTES + (4 + len(FLOORS)) * n_cells**3) / 1e9
+        gigabytes = (PROGRAM_BYTES + (CULLING_BYTES + len(FLOORS)) * n_cells**3) / 1e9
         plan = make_plan(model, BakeConfig(preset=preset, max_memory=gigabytes))
         assert plan.resolutions.features <= n_cells and plan.resolutions.densities < wanted.densities
 
@@ -227,13 +229,15 @@ def test_the_expected_time_follows_from_that_of_the_models_own_rays(
 def test_what_is_chosen_of_many_vertices_is_expected_to_take_longer(
     model: Model, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """More vertices are expected to take longer to choose from, by a clock of 1 second a teacher's ray."""
+    """More vertices are expected to take longer to choose from, by a clock of 1 second a teacher's ray. A
+    view has at most as many rays as pixels."""
     now = 0.0
 
-    def answer(model: Model, views: object, n_rays: int, *_: object) -> SimpleNamespace:
+    def answer(model: Model, views: list[Camera], n_rays: int, *_: object) -> SimpleNamespace:
         nonlocal now
-        now += n_rays
-        return SimpleNamespace(opacity=np.ones(n_rays))
+        n_rendered = sum(min(n_rays // len(views), view.width * view.height) for view in views)
+        now += n_rendered
+        return SimpleNamespace(opacity=np.ones(n_rendered))
 
     monkeypatch.setattr("vfr_bake.baking.plan.time", SimpleNamespace(perf_counter=lambda: now))
     monkeypatch.setattr("vfr_bake.baking.plan.render_teacher", answer)

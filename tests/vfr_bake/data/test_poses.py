@@ -218,7 +218,7 @@ def test_an_interrupted_estimation_goes_on_where_it_was(can, tmp_path: Path, kep
 
 
 def test_pictures_that_are_added_later_are_told_of(can, tmp_path: Path) -> None:
-    photos = first_pictures(can, tmp_path, 4)
+    photos = first_pictures(can, tmp_path, N_CAN)
     shutil.copytree(can[0] / "sparse", photos / "sparse")
     assert added_since(photos) == []
     shutil.copy(min(photos.glob("*.jpg")), photos / "new.jpg")

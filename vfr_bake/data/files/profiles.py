@@ -26,7 +26,8 @@ def as_srgb(rgba: np.ndarray, profile: object) -> np.ndarray:
         return rgba
     try:
         own = ImageCms.ImageCmsProfile(io.BytesIO(profile))
-        if "sRGB" in ImageCms.getProfileDescription(own):
+        name = ImageCms.getProfileDescription(own)
+        if "sRGB" in name and "linear" not in name.lower():
             return rgba
         colours = ImageCms.profileToProfile(
             Image.fromarray(np.ascontiguousarray(rgba[..., :3])),

@@ -14,23 +14,19 @@ NAME = "source.txt"
 
 def note_source(folder: Path, source: Path) -> None:
     """Note in `folder` that it is made from the file `source`."""
-    (folder / NAME).write_text(_note(source), encoding="utf-8")
+    (folder / NAME).write_bytes(_note(source))
 
 
 def check_source(folder: Path, source: Path) -> None:
     """Raise DataError if `folder` has a note that it was made from another file than `source`. A folder
     without a note is trusted, and so is one whose source is gone."""
     path = folder / NAME
-    if (
-        path.exists()
-        and source.exists()
-        and read_bytes(path, "the name of a file", 10_000) != _note(source).encode()
-    ):
+    if path.exists() and source.exists() and read_bytes(path, "the name of a file", 10_000) != _note(source):
         raise DataError(
             f"{folder}: expected to be made from {source.name} as it is now, got a folder that was made from "
             "another file: remove it, or name the folder itself to use it"
         )
 
 
-def _note(source: Path) -> str:
-    return f"{source.name!a}\n{source.stat().st_size}\n"
+def _note(source: Path) -> bytes:
+    return f"{source.name!a}\n{source.stat().st_size}\n".encode()
