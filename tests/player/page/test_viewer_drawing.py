@@ -62,15 +62,29 @@ def test_the_window_may_change_its_size(chromium: Browser) -> None:
         wait_for(page, lambda: page.evaluate("() => drawn.at(-1).width") == 200)
 
 
+SCREENS = b"""
+globalThis.screens = []; // the queries for the screen's resolution, each with what hears that it has changed
+const usual = matchMedia.bind(globalThis);
+globalThis.matchMedia = (query) => !query.startsWith("(resolution") ? usual(query) : {
+  addEventListener: (name, heard, options) => { screens.push({ query, name, heard, once: options.once }); },
+};
+"""
+"""JavaScript that takes note of `matchMedia`: Chromium does not report that a test changes the resolution."""
+
+
 def test_a_window_that_moves_to_a_screen_of_smaller_pixels_is_drawn_anew(chromium: Browser) -> None:
-    with opened(chromium, FILES, "#turn=off") as (page, *_):
+    files = FILES | {"renderer.js": SCREENS + FILES["renderer.js"]}
+    with opened(chromium, files, "#turn=off") as (page, *_):
         before = still(page)
         client = page.context.new_cdp_session(page)
         metrics = {"width": 640, "height": 480, "deviceScaleFactor": 2, "mobile": False}
         client.send("Emulation.setDeviceMetricsOverride", metrics)
+        page.evaluate("() => screens[0].heard()")
         wait_for(page, lambda: page.evaluate("() => drawn.at(-1).width") == 1280)
         after = still(page)
         assert [after["width"], after["height"]] == [2 * before["width"], 2 * before["height"]]
+        asked = page.evaluate("() => screens.map(({ query, name, once }) => [query, name, once])")
+        assert asked == [[f"(resolution: {ratio}dppx)", "change", True] for ratio in (1, 2)]
 
 
 def test_layers_that_are_not_added_up_are_drawn_once_at_full_size(chromium: Browser) -> None:
