@@ -80,7 +80,7 @@ PRESETS: dict[Preset, BakeChoice] = {
     "fast": BakeChoice(
         cells_per_pixel=1.55, contracted_resolution=640, feature_share=0.68, culled_loss_db=0.1,
         n_channels=16, channel_loss_db=0.25, n_fetches=12, sample_loss_db=0.1,
-        code_loss_db=0.55, density_step=6, code_levels=50, head_width=48, head_layers=1,
+        code_loss_db=0.67, density_step=6, code_levels=50, head_width=48, head_layers=1,
         head_bands=3, head_bits=8, refine_steps=4000, mesh_resolution=48, target_loss_db=1.0,
         page_mb=512,
     ),
