@@ -22,7 +22,7 @@ import yaml
 from exporters import cli as exporters_cli
 from exporters.formats.ply import ply_bytes
 from exporters.options import check_options
-from player import Asset, errors
+from player import Asset
 from player.app.option_types import joined_negatives
 from player.app.options import parse as parse_play
 from player.asset.asset import GridArrays, write_asset
@@ -495,12 +495,3 @@ def test_sources_name_pages_that_exist() -> None:
         for path in (REPOSITORY / folder).rglob("*.py"):
             for page in re.findall(r"docs/[\w/-]+\.md", path.read_text(encoding="utf-8")):
                 assert (REPOSITORY / page).is_file(), f"{path.relative_to(REPOSITORY)}: {page}"
-
-
-def test_the_table_of_errors_is_the_classes() -> None:
-    rows = re.findall(r"^\| `(\w+Error)` \|(.*?)\|", read("docs/python.md"), re.MULTILINE)
-    classes = {name for name, kind in vars(errors).items() if isinstance(kind, type)}
-    assert {name for name, _ in rows} == classes - {"VfrError"}
-    for name, also in rows:
-        bases = [base.__name__ for base in getattr(errors, name).__bases__ if base.__name__ != "VfrError"]
-        assert bases == re.findall(r"`(\w+)`", also), name

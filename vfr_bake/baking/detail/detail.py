@@ -144,10 +144,8 @@ class Detail:
             steps = np.minimum(1 << np.arange(grid.n_levels), longest).astype(np.int32)
             after = self._stage(replace(grid, level_steps=steps))
             fits = max_loss_db is None or after.loss.db <= max_loss_db
-            if (
-                fits
-                and self.held_out.lost_by_leaving_out(before, after.shown).most <= STEP_LOSS * self.most_db
-            ):
+            lost = self.held_out.lost_by_leaving_out(before, after.shown)
+            if fits and lost.most <= STEP_LOSS * self.most_db:
                 return tuple(steps.tolist())
         return (1,) * grid.n_levels
 
