@@ -20,9 +20,11 @@ LACKING = {
     "programs": not (sys.platform == "linux" and platform.machine() == "x86_64"),
     "open3d": sys.platform == "linux" and platform.machine() != "x86_64",
     "signals": os.name == "nt",
+    "forks": not hasattr(os, "fork"),
 }
 """What this platform does not have: the programs that `make` installs from Debian's or Ubuntu's packages,
-Open3D where pyproject.toml does not ask for it, and Ctrl-C that is sent to a process."""
+Open3D where pyproject.toml does not ask for it, Ctrl-C that is sent to a process, and processes that are
+copies of another."""
 LONGEST = (
     "tests/vfr_bake/baking/test_bake.py",
     "tests/player/compiled/test_processor.py",
@@ -41,7 +43,7 @@ LONGEST = (
 """Files that take longest, begun first: no worker is then left alone with one of them at the end. The first
 two are begun at the same time, in a clean checkout before anything is compiled: the second compiles for other
 processors, so that they do not both compile the same."""
-N_TESTS = {"programs": 13, "open3d": 36, "signals": 1}
+N_TESTS = {"programs": 13, "open3d": 36, "signals": 1, "forks": 2}
 """Tests marked `needs(...)`: so many are skipped where that is lacking, and no other test anywhere."""
 
 

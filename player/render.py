@@ -7,6 +7,7 @@ neither on the number of threads nor on the size of a task.
 
 from __future__ import annotations
 
+import os
 import sys
 import threading
 from collections.abc import Callable, Iterable
@@ -92,7 +93,8 @@ class Frame:
 
 class Renderer:
     """An asset that is ready to render: its grid is in memory, its head is open, and threads are waiting. A
-    context manager; `close` ends the threads."""
+    context manager; `close` ends the threads. A forked process may render on with it, on threads of its own.
+    """
 
     def __init__(self, asset: Asset, n_threads: int | None = None, march: March = "auto") -> None:
         """Raises MissingExtraError if `march` is "numba" and that is not installed or does not run here."""
@@ -113,7 +115,7 @@ class Renderer:
         self.asset = asset
         self._head = Head(asset.path("head.onnx"), asset.manifest.n_channels, self.march == "numba")
         self._model_from_world = np.linalg.inv(asset.world_from_model)
-        self._pool = ThreadPoolExecutor(self.n_threads, thread_name_prefix="vfr-play")
+        self._pool, self._process = self._new_pool(), os.getpid()
 
     def __enter__(self) -> Renderer:
         return self
@@ -123,7 +125,18 @@ class Renderer:
 
     def close(self) -> None:
         """End the threads; tasks that have not begun are dropped."""
-        self._pool.shutdown(wait=True, cancel_futures=True)
+        self._threads().shutdown(wait=True, cancel_futures=True)
+
+    def _new_pool(self) -> ThreadPoolExecutor:
+        return ThreadPoolExecutor(self.n_threads, thread_name_prefix="vfr-play")
+
+    def _threads(self) -> ThreadPoolExecutor:
+        """Return the threads. A forked process has none of those that the pool counts, and would wait for
+        them forever: it gets a pool of its own."""
+        if self._process != os.getpid():
+            self._pool = self._new_pool()
+            self._process = os.getpid()  # last: whichever thread of the process sees it sees the new pool
+        return self._pool
 
     def show(self, asset: Asset) -> None:
         """Continue with `asset`, the same asset with more of its parts. Pictures that have begun, in
@@ -169,7 +182,7 @@ class Renderer:
             self._in_tasks(picture, stage)
         view, planes, features = picture.view, picture.planes, picture.features
         shape = (camera.height, camera.width)
-        normals = self._all_normals(view, self._pool.map) if layers else None
+        normals = self._all_normals(view, self._threads().map) if layers else None
         return Frame(
             planes.rgb.reshape(*shape, 3),
             planes.opacity.reshape(shape),
@@ -214,7 +227,8 @@ class Renderer:
     def _in_tasks(self, picture: _Picture, stage: MarchStage) -> None:
         """Compute the pixels of a stage in all blocks, on all threads."""
         tasks = self._tasks(picture.view.blocks, len(stage.within))
-        futures = [self._pool.submit(self._task, picture, stage, blocks) for blocks in tasks]
+        pool = self._threads()
+        futures = [pool.submit(self._task, picture, stage, blocks) for blocks in tasks]
         try:
             for future in futures:
                 future.result()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -38,6 +40,27 @@ FAR_OPACITY = Row(
     "Rays", "mean opacity of a picture from far away", "1e4 and 1e8 units, with as long a lens", 0.01,
     at_ends="the renderer starts rays beside the box; with an ordinary lens the background is seen, exactly",
 )  # fmt: skip
+
+FORKED = """
+import os, signal, sys
+from player import Asset, Renderer
+from player.cameras.views import asset_cameras
+from player.render import render
+asset, march = Asset.open(sys.argv[1]), sys.argv[2]
+camera = asset_cameras(asset)[0]
+with Renderer(asset, 2, march) as held:
+    def pictures():
+        frames = render(asset, camera, n_threads=2, march=march), held.render(camera, layers=True)
+        return [frame.rgb.tobytes() for frame in frames]
+    expected = pictures()
+    child = os.fork()
+    if child == 0:
+        signal.alarm(60)  # ends the process if it waits for threads that it does not have
+        same = pictures() == expected
+        held.close()
+        os._exit(0 if same else 1)
+    sys.exit(os.waitpid(child, 0)[1] != 0)
+"""
 
 
 @pytest.fixture
@@ -88,6 +111,14 @@ def test_threads_and_tasks_do_not_change_a_bit(
     for frame in frames[1:]:
         for name in ("rgb", "opacity", "depth", "n_density_samples"):
             THREADS.holds(getattr(frame, name).tobytes() == getattr(frames[0], name).tobytes())
+
+
+@pytest.mark.needs("forks")
+@pytest.mark.parametrize("module", ["numpy", pytest.param("numba", marks=pytest.mark.extra)])
+def test_a_forked_process_renders(module: str, shells_folder: Path) -> None:
+    """As `multiprocessing` makes them on Linux up to Python 3.13, after the parent has rendered."""
+    command = [sys.executable, "-W", "ignore::DeprecationWarning", "-c", FORKED, str(shells_folder), module]
+    subprocess.run(command, check=True)
 
 
 @pytest.mark.parametrize("view", ["outside", "inside", "beside", "short", "long"])
