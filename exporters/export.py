@@ -17,12 +17,13 @@ import numpy as np
 from exporters.export_mesh import NEARER, bounds_of, check_packages, export_mesh, mesh_paths, world_mesh
 from exporters.formats import npz, points, vdb
 from exporters.formats.axes import coordinates_from_world
-from exporters.formats.colmap import COLMAP_FILES, colmap_files
+from exporters.formats.colmap import colmap_files, is_model_file
+from exporters.formats.exr import is_picture
 from exporters.formats.parity import check_points_bytes, check_steps, check_volume_bytes
 from exporters.formats.transforms import moved_cameras, transforms_bytes
 from exporters.head.asset_head import head_bytes
 from exporters.options import FOLDERS, MESHES, POINTS, ExportOptions, check_options
-from exporters.pages import export_page
+from exporters.pages import export_page, is_page_file
 from exporters.pictures import export_pictures
 from exporters.shapes.crop import parse_crop
 from exporters.shapes.mesh import TriangleMesh
@@ -35,7 +36,6 @@ from player.cameras.transforms import frame_names
 from player.cameras.views import asset_cameras, read_views
 from player.errors import OutputError
 from player.files.files import check_target, new_folder, write_bytes
-from player.page.page import is_site_file
 from player.progress import Report, silent
 
 Facts = dict[str, Any]
@@ -197,20 +197,18 @@ def _views(asset: Asset, options: ExportOptions) -> tuple[list[Camera], list[str
 def _check_target(asset_path: Path, target: Path, name: str, force: bool) -> bool:
     """Raise OutputError if the target cannot be written, before any work; return whether to replace it.
 
-    A folder is replaced as a whole, so it must hold nothing but an earlier export of its kind.
+    A folder is replaced as a whole, so it must hold nothing but an earlier export of its kind. The content of
+    its files is looked at, because other programs give theirs the same names.
     """
     is_folder = name in FOLDERS
     if target.is_dir() and is_folder:
-        belongs = {
-            "exr": lambda file: file.endswith(".exr"),
-            "colmap": COLMAP_FILES.__contains__,
-            "web": is_site_file,
-        }[name]
-        found = sorted(path.name for path in target.iterdir())
-        other = [file for file in found if not belongs(file)]
+        is_ours = {"exr": is_picture, "colmap": is_model_file, "web": is_page_file}[name]
+        found = sorted(target.iterdir())
+        other = [file.name for file in found if not is_ours(file)]
         if other:
             raise OutputError(
-                f"{target}: expected no folder, or one of {name} files alone, got {other[0]} in it"
+                f"{target}: expected no folder, or one of {name} files that vfr-export wrote, got {other[0]} "
+                "in it: name another folder"
             )
         force = force or not found
     elif target.exists() and target.is_dir() != is_folder:

@@ -13,8 +13,10 @@ their ERROR is 0.
 from __future__ import annotations
 
 import struct
+import sys
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -22,13 +24,19 @@ import numpy as np
 from exporters.formats.transforms import check_cameras
 from exporters.shapes.mesh import TriangleMesh
 from player.cameras.camera import Camera
+from player.cameras.colmap import MAX_FILE_BYTES
 from player.cameras.rotations import OPENGL_FROM_OPENCV, quaternion, rotation_matrix
-from player.errors import ParityError
+from player.errors import FormatError, ParityError
+from player.files.files import open_file, read_bytes
 
 TEXT_FILES = ("cameras.txt", "images.txt", "points3D.txt")
 BINARY_FILES = ("cameras.bin", "images.bin", "points3D.bin")
-COLMAP_FILES = TEXT_FILES + BINARY_FILES
-"""The names that the files of a model may have."""
+_HEADS = (
+    "# CAMERA_ID, MODEL, WIDTH, HEIGHT, fx, fy, cx, cy",
+    "# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME, then a line of keypoints (none)",
+    "# POINT3D_ID, X, Y, Z, R, G, B, ERROR, then its track (none)",
+)
+"""The first lines of the text files."""
 TOLERANCE = 1e-9
 """Largest relative difference of a camera read back: poses go through a quaternion and back, in float64."""
 
@@ -94,6 +102,49 @@ def colmap_files(cameras: Sequence[Camera], cloud: TriangleMesh) -> dict[str, by
     return files
 
 
+def is_model_file(path: Path) -> bool:
+    """Return whether a file is one of a model that was written here.
+
+    The text files begin with their own lines. Binary files have no room for a mark: they count as written
+    here if they have what this writer gives them, numbers 1, 2, ..., pinhole cameras, pictures without
+    keypoints, and points without tracks or errors.
+    """
+    try:
+        if path.name in TEXT_FILES:
+            head = _HEADS[TEXT_FILES.index(path.name)].encode() + b"\n"
+            with open_file(path, "a COLMAP model", sys.maxsize) as file:
+                return file.read(len(head)) == head
+        if path.name not in BINARY_FILES:
+            return False
+        data = read_bytes(path, "a COLMAP model", MAX_FILE_BYTES)
+    except FormatError:  # a folder, or not readable
+        return False
+    if path.name == "images.bin":
+        return _has_no_keypoints(data)
+    kind, column, value = (_LENS, "model", _PINHOLE) if path.name == "cameras.bin" else (_POINT, "error", 0)
+    n, rest = divmod(len(data) - _COUNT.size, kind.itemsize)
+    if n < 1 or rest or _COUNT.unpack_from(data)[0] != n:  # other lenses, or tracks, make entries longer
+        return False
+    rows = np.frombuffer(data, kind, n, _COUNT.size)
+    return bool((rows["id"] == np.arange(1, n + 1)).all() and (rows[column] == value).all())
+
+
+def _has_no_keypoints(data: bytes) -> bool:
+    """Return whether the content of an `images.bin` is as `_binary_files` writes it."""
+    try:
+        at = _COUNT.size
+        (n_images,) = _COUNT.unpack_from(data)
+        for number in range(1, n_images + 1):
+            found = _IMAGE.unpack_from(data, at)[0]
+            at = data.index(b"\0", at + _IMAGE.size) + 1
+            if found != number or _COUNT.unpack_from(data, at)[0]:
+                return False
+            at += _COUNT.size
+    except (struct.error, ValueError):  # cut short
+        return False
+    return at == len(data)
+
+
 def _model(cameras: Sequence[Camera], cloud: TriangleMesh) -> _Model:
     lenses: dict[tuple[float, ...], int] = {}
     images = []
@@ -119,21 +170,19 @@ def _name(camera: Camera) -> str:
 
 
 def _text_files(model: _Model) -> dict[str, bytes]:
-    lenses = ["# CAMERA_ID, MODEL, WIDTH, HEIGHT, fx, fy, cx, cy"]
-    lenses += [f"{i} PINHOLE {lens[0]} {lens[1]} {_numbers(lens[2:])}" for i, lens in model.lenses.items()]
-    images = ["# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME, then a line of keypoints (none)"]
+    lenses = [f"{i} PINHOLE {lens[0]} {lens[1]} {_numbers(lens[2:])}" for i, lens in model.lenses.items()]
+    images = []
     for number, image in enumerate(model.images, start=1):
         images += [f"{number} {_numbers(image.pose)} {image.lens} {image.name}", ""]
-    points = ["# POINT3D_ID, X, Y, Z, R, G, B, ERROR, then its track (none)"]
-    points += [
+    points = [
         f"{number} {_numbers(place)} {red} {green} {blue} 0"
         for number, (place, (red, green, blue)) in enumerate(
             zip(model.places.tolist(), model.colours.tolist(), strict=True), start=1
         )
     ]
     return {
-        name: ("\n".join(lines) + "\n").encode()
-        for name, lines in zip(TEXT_FILES, (lenses, images, points), strict=True)
+        name: ("\n".join([head, *lines]) + "\n").encode()
+        for name, head, lines in zip(TEXT_FILES, _HEADS, (lenses, images, points), strict=True)
     }
 
 

@@ -22,6 +22,8 @@ the channels of a layer; the channels of the features have numbers.
 
 from __future__ import annotations
 
+import struct
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +32,8 @@ import numpy as np
 from exporters.extras import needs
 from exporters.shapes.colour import linear_from_srgb
 from player.cameras.camera import Camera
-from player.errors import OutputError, ParityError, ShapeError
+from player.errors import FormatError, OutputError, ParityError, ShapeError
+from player.files.files import open_file
 from player.march.march import MIN_OPACITY
 from player.render import Frame
 
@@ -41,6 +44,10 @@ DEPTH = (
     "mean by compositing weight; Z along the camera's axis, distance.V along the ray; world units; "
     "infinite where A <= 1/512"
 )
+
+SOFTWARE = "vfr-export"
+"""The attribute `software` of every picture written here."""
+_HEADER_BYTES = 1 << 16  # more than the attributes of a picture written here take
 
 
 def exr_channels(frame: Frame, camera: Camera, half: bool = False) -> dict[str, np.ndarray]:
@@ -106,7 +113,7 @@ def exr_header(camera: Camera) -> dict[str, Any]:
     )
     return {
         "chromaticities": REC709,
-        "software": "vfr-export",
+        "software": SOFTWARE,
         "worldToCamera": np.ascontiguousarray(w2c.T, np.float32),
         "worldToNDC": np.ascontiguousarray((ndc_from_camera @ w2c).T, np.float32),
         "vfr.camera": camera.name,
@@ -141,6 +148,18 @@ def write_exr(path: Path, channels: dict[str, np.ndarray], header: dict[str, Any
             _check_header(path, header, file.header())
     except RuntimeError as error:
         raise OutputError(f"{path}: cannot write: {error}") from error
+
+
+def is_picture(path: Path) -> bool:
+    """Return whether a file is a picture that was written here, as its attribute `software` says. This needs
+    no OpenEXR."""
+    try:
+        with open_file(path, "a picture", sys.maxsize) as file:
+            header = file.read(_HEADER_BYTES)
+    except FormatError:  # a folder, or not readable
+        return False
+    software = b"software\0string\0" + struct.pack("<i", len(SOFTWARE)) + SOFTWARE.encode()
+    return path.suffix == ".exr" and header.startswith(b"v/1\x01") and software in header
 
 
 def load_openexr() -> Any:

@@ -8,6 +8,8 @@ import re
 import shlex
 import shutil
 import stat
+import struct
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -180,12 +182,68 @@ def test_a_folder_with_other_things_is_not_replaced(
     target.mkdir()
     (target / "holiday.png").write_text("mine")
     error = fails([str(shells_asset), str(target), "--format", kind, "--force"], capsys)
-    assert f"expected no folder, or one of {kind} files alone, got holiday.png in it" in error
+    wanted = f"expected no folder, or one of {kind} files that vfr-export wrote, got holiday.png in it"
+    assert wanted in error
     assert (target / "holiday.png").read_text() == "mine"
     error = fails([str(shells_asset), str(target), "--format", "stl", "--force"], capsys)
     assert "expected the name of a file, got a folder" in error
     error = fails([str(shells_asset), str(target / "holiday.png"), "--format", kind, "--force"], capsys)
     assert "expected the name of a folder, got a file" in error
+
+
+COLMAP_S_TEXT = {
+    "cameras.txt": "# Camera list with one line of data per camera:\n1 PINHOLE 4 3 5 5 2 1.5\n",
+    "images.txt": "# Image list with two lines of data per image:\n1 1 0 0 0 0 0 0 1 a.png\n2 1 -1\n",
+    "points3D.txt": "# 3D point list with one line of data per point:\n",
+}
+
+
+@pytest.mark.parametrize("kind", ["exr", "text", "keypoints", "tracks", "distorted", "web"])
+def test_a_folder_of_other_programs_files_is_not_replaced(
+    kind: str, shells_asset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Files that another program wrote under the names of an export are kept, for example the model of
+    COLMAP that the photographs came with."""
+    radial = struct.pack("<QIiQQ4d", 1, 1, 2, 4, 3, 5, 2, 1.5, 0.1)
+    image = struct.pack("<QI7dI", 1, 1, 1, 0, 0, 0, 0, 0, 0, 1) + b"a.png\0"
+    point = struct.pack("<QQ3d3Bd", 1, 1, 0, 0, 0, 9, 9, 9, 0)
+    none = bytes(8)
+    contents: dict[str, dict[str, bytes]] = {
+        "exr": {"a.exr": b"v/1\x01" + bytes(99)},
+        "text": {name: text.encode() for name, text in COLMAP_S_TEXT.items()},
+        "keypoints": {"images.bin": image + struct.pack("<QddQ", 1, 2, 1, 2**64 - 1)},
+        "tracks": {"images.bin": image + none, "points3D.bin": point + struct.pack("<QII", 1, 1, 0)},
+        "distorted": {"cameras.bin": radial},
+        "web": {"index.html": b"mine", "main.js": b"mine", "manifest.json": b'{"name": "mine"}'},
+    }
+    target = tmp_path / "mine"
+    target.mkdir()
+    for name, data in contents[kind].items():
+        (target / name).write_bytes(data)
+    name = kind if kind in ("exr", "web") else "colmap"
+    error = fails([str(shells_asset), str(target), "--format", name, "--force"], capsys)
+    assert f"expected no folder, or one of {name} files that vfr-export wrote, got " in error
+    assert {path.name: path.read_bytes() for path in target.iterdir()} == contents[kind]
+
+
+@pytest.mark.parametrize(
+    "arguments", ["--format exr --views 0 --size 5x4", "--format colmap", "--format web", "binary"]
+)
+def test_an_earlier_export_is_replaced(
+    arguments: str, shells_asset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if arguments == "binary":  # names with spaces make the binary files of COLMAP
+        spaced = [
+            replace(camera, name=f"a {camera.name}") for camera in asset_cameras(Asset.open(shells_asset))
+        ]
+        monkeypatch.setattr(export, "asset_cameras", lambda asset: spaced)
+        arguments = "--format colmap --points 9"
+    command = [str(shells_asset), str(tmp_path / "d"), *shlex.split(arguments)]
+    assert cli.main(command) == 0
+    before = {path.name: path.stat().st_mtime_ns for path in (tmp_path / "d").iterdir()}
+    assert cli.main([*command, "--force"]) == 0
+    after = {path.name: path.stat().st_mtime_ns for path in (tmp_path / "d").iterdir()}
+    assert sorted(after) == sorted(before) and after != before
 
 
 def test_the_asset_is_not_overwritten(shells_asset: Path, capsys: pytest.CaptureFixture[str]) -> None:
