@@ -22,7 +22,8 @@ from PIL import Image
 
 from player.asset.asset import Asset
 from player.errors import DataError
-from vfr_bake.cli import EVAL_VIEWS, _test_figures, _with_cameras, bake_main, eval_main, train_main
+from vfr_bake.cli import bake_main, eval_main, train_main
+from vfr_bake.commands.train import EVAL_VIEWS, _test_figures, _with_cameras
 from vfr_bake.config import EFFORT_MINUTES, TrainConfig
 from vfr_bake.data import load_scene
 from vfr_bake.data.poses import PoseReport

@@ -12,9 +12,9 @@ from player.asset.asset import Asset
 from player.march import march
 from tests.player.march.test_march import random_rays
 from tests.player.test_proof import DIES, WRONG, child_runs, lines, nothing_known
-from vfr_bake import cli
 from vfr_bake.baking import bake, plan
 from vfr_bake.baking.held_out import HeldOut
+from vfr_bake.commands.bake import bake_command
 from vfr_bake.training import model_file
 
 __all__ = ["nothing_known"]
@@ -38,7 +38,7 @@ def test_a_bake_asks_before_it_begins(
         convert=None,
     )
     with pytest.raises(KeyboardInterrupt):
-        cli._bake(options)
+        bake_command(options)
     assert "vfr-bake: compiled code does not run on this processor (SIGABRT)" in capfd.readouterr().err
 
 

@@ -1,0 +1,86 @@
+"""`vfr-bake`: a bake, or with --convert the conversion of an asset."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import asdict
+from typing import Any
+
+from player.app.commands import write_result
+from player.errors import ConfigError
+from player.files.files import check_target
+from player.progress import Bar, Bars
+from vfr_bake.config import BakeConfig
+
+
+def bake_command(options: Any) -> int:
+    """Bake as `options` says (`vfr_bake.options.Bake`), or convert an asset; return the exit code."""
+    check_target(options.asset, options.force)
+    if options.convert:
+        return _convert(options)
+    from player.proof import prove
+    from vfr_bake.baking.bake import bake, check_bakeable
+    from vfr_bake.baking.plan import COMPILE_SECONDS, expected_seconds, is_compiled, make_plan
+    from vfr_bake.training.model_file import load_model
+
+    model = load_model(options.model, options.config.max_memory)
+    check_bakeable(model, options.config)
+    plan = make_plan(model, options.config)
+    minutes = expected_seconds(model, options.config, plan) / 60
+    fine, coarse = plan.resolutions
+    first = f", {COMPILE_SECONDS:.0f} s of them to compile its code for the first time,"
+    compiling = "" if is_compiled() else first
+    print(
+        f"vfr-bake: about {max(minutes, 0.1):.1f} minutes{compiling} and {plan.n_bytes / 1e9:.1f} GB of "
+        f"memory ({options.config.max_memory:g} GB at most), densities on at most {fine} cells per axis and "
+        f"features on {coarse}, about {plan.n_rays(plan.n_cells):,} rays to learn from",
+        file=sys.stderr,
+    )
+    prove(lambda text: print(f"vfr-bake: {text}", file=sys.stderr))  # the bake will play the asset at its end
+    with Bars() as bars:
+        result = bake(model, options.asset, options.config, bars.count, options.force)
+    megabytes = result.n_bytes / 1e6
+    written = {"asset": str(options.asset), "megabytes": megabytes, "seconds": result.seconds}
+    write_result(
+        options.json,
+        written | result.figures,
+        f"{options.asset}: {megabytes:.1f} MB, {result.n_vertices:,} vertices, "
+        f"{result.figures['mesh_faces']:,} faces, baked in {result.seconds:.0f} s; as played it agrees "
+        f"with the full model to {result.figures['psnr_to_full_model']:.1f} dB and loses {result.loss} "
+        f"against photographs: see {options.asset / 'report.html'}",
+    )
+    if result.loss.spread is None:
+        print(
+            "vfr-bake: the model has no witnesses (docs/train.md), so that the loss is estimated from its "
+            "own pictures: train again to have it measured against photographs",
+            file=sys.stderr,
+        )
+    for missed in result.missed:
+        print(f"vfr-bake: warning: {missed}: see report.html for where it goes", file=sys.stderr)
+    return 0
+
+
+def _convert(options: Any) -> int:
+    from vfr_bake.baking.convert import convert
+
+    given = [name for name, value in asdict(options.config).items()
+             if name != "max_memory" and value != getattr(BakeConfig(), name)]  # fmt: skip
+    if given:
+        raise ConfigError(f"--convert: expected no other setting than --max-memory, got {sorted(given)}")
+    with Bar("converting") as bar:
+        done = convert(options.model, options.asset, options.config.max_memory, options.force, bar.count)
+    before = sum(entry.bytes for entry in done.asset.manifest.files.values())
+    version = done.asset.manifest.version
+    write_result(
+        options.json,
+        {
+            "asset": str(options.asset),
+            "megabytes": done.n_bytes / 1e6,
+            "megabytes_before": before / 1e6,
+            "version_before": list(version),
+            "seconds": done.seconds,
+        },
+        f"{options.asset}: {done.n_bytes / 1e6:.1f} MB, rewritten from {options.model} (version "
+        f"{version[0]}.{version[1]}, {before / 1e6:.1f} MB) in {done.seconds:.0f} s",
+    )
+    return 0

@@ -1,0 +1,93 @@
+"""`vfr-eval` and `vfr-bench`: a model, or assets of it, compared with photographs."""
+
+from __future__ import annotations
+
+import math
+import sys
+from dataclasses import asdict, replace
+from typing import Any
+
+from player.app.commands import write_result
+from player.errors import DataError
+from player.files.files import check_target, write_bytes
+from player.progress import Bar, Bars
+
+
+def eval_command(options: Any) -> int:
+    """Evaluate a model as `options` says (`vfr_bake.options.Eval`); return the exit code."""
+    import numpy as np
+
+    from player.cameras.transforms import frame_names
+    from player.files.images import write_png
+    from vfr_bake.data import load_scene_as
+    from vfr_bake.training.model_file import load_model
+    from vfr_bake.training.scores.evaluation import render_views
+    from vfr_bake.training.scores.lpips import Lpips
+    from vfr_bake.training.scores.metrics import comparison, mean_scores
+
+    lpips = None if options.lpips is None else Lpips(options.lpips)
+    model = load_model(options.model, options.max_memory)
+    with Bar("reading pictures") as bar:
+        scene = load_scene_as(model.train, options.data, bar.count)
+    if not scene.test.cameras:
+        raise DataError(f"{options.data}: test views: expected at least 1, got none")
+    to_model = np.linalg.inv(model.world_from_model)
+    world = [c.transformed(scene.world_from_model) for c in scene.test.cameras]
+    views = replace(scene.test, cameras=[c.transformed(to_model) for c in world])
+    names = frame_names(views.cameras)
+    scores = []
+    with Bar("test views") as bar:
+        for view in render_views(model, views, masked=scene.masked):
+            if options.pictures is not None:
+                picture = comparison(view.photograph, view.rgb)
+                write_png(options.pictures / f"{names[len(scores)]}.png", picture)
+            scores.append(view.score(lpips))
+            bar.count(len(scores), len(world))
+    means = mean_scores(scores)
+    figures = finite(means) | {
+        "per_view": [finite(asdict(score)) for score in scores],
+        "n_views": len(scores),
+        "background": model.background.tolist(),
+        "bits": 8,
+        "exposure_fitted": model.exposure is not None,
+        "lpips_network": options.lpips,
+    }
+    perceptual = "" if lpips is None else f", LPIPS ({lpips.network}) {means['lpips']:.4f}"
+    write_result(
+        options.json,
+        figures,
+        f"{options.model}: {means['psnr']:.2f} dB mean PSNR, SSIM {means['ssim']:.4f}{perceptual} "
+        f"over {len(scores)} test views"
+        + (" (exposure fitted on their left halves, right halves scored)" if model.exposure else ""),
+    )
+    return 0
+
+
+def bench_command(options: Any) -> int:
+    """Measure assets as `options` says (`vfr_bake.options.Bench`); return the exit code."""
+    from vfr_bake.bench.page import table_lines, trade_page
+    from vfr_bake.bench.trade import measure_trade
+    from vfr_bake.training.scores.lpips import Lpips
+
+    options.check()
+    for target in (options.html, options.json):
+        if target is not None and str(target) != "-":
+            check_target(target, options.force, is_file=True)
+    lpips = None if options.lpips is None else Lpips(options.lpips)
+    with Bars() as bars:
+        trade = measure_trade(options, lpips, bars.count)
+    if (timed := trade.conditions["frames_a_setting_and_size"]) < options.frames:
+        print(
+            f"vfr-bench: timed {timed} of {options.frames} frames of each setting and size in "
+            f"{options.minutes:g} minutes: for more, raise --minutes or give --samples and --sizes",
+            file=sys.stderr,
+        )
+    if options.html is not None:
+        write_bytes(options.html, trade_page(trade))
+    write_result(options.json, trade.document(), "\n".join([*table_lines(trade), trade.recommendation]))
+    return 0
+
+
+def finite(figures: dict[str, Any]) -> dict[str, Any]:
+    """Replace infinite figures by None, because JSON has no number for the PSNR of equal pictures."""
+    return {key: None if value == math.inf else value for key, value in figures.items()}

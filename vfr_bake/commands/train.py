@@ -1,0 +1,309 @@
+"""`vfr-train`: the cameras, the pictures, the training with its checkpoints, and what is said about them."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from player.app.commands import write_result
+from player.errors import MissingExtraError, VfrError
+from player.files.files import check_target, write_bytes
+from player.progress import Bar, Bars
+from player.terminal import printable
+from vfr_bake.commands.evaluate import finite
+from vfr_bake.config import TrainConfig
+
+if TYPE_CHECKING:
+    from vfr_bake.data.scene import Scene
+    from vfr_bake.training.model_file import Model
+    from vfr_bake.training.preview import Preview
+    from vfr_bake.training.processes import Processes
+    from vfr_bake.training.trainer import Trainer
+
+EVAL_VIEWS = {False: 10, True: 3}
+"""Number of test views rendered at the end if none is asked for, by whether the scene is unbounded."""
+
+GLANCED_AT = 24
+"""Most pictures that a run looks at before it begins; `--check` looks at as many as ten seconds allow."""
+
+
+def train_command(options: Any) -> int:
+    """Train, or look at the pictures alone, as `options` says (`vfr_bake.options.Train`); return the exit
+    code."""
+    from vfr_bake.data import load_scene, training_reader
+    from vfr_bake.training.checkpoint import checkpoint_path, load_checkpoint
+    from vfr_bake.training.model_file import save_model, trained_model
+    from vfr_bake.training.processes import Processes
+    from vfr_bake.training.trainer import Trainer
+
+    if options.check:
+        return _check(options)
+    if options.model is None:
+        print("vfr-train: expected a model file to write, or --check; see vfr-train --help", file=sys.stderr)
+        return 2
+    check_target(options.model, options.force, is_file=True)
+    config = options.config
+    processes = Processes.from_environment()
+    # The pictures of a ZIP or a video can be looked at only once they are unpacked.
+    packed = not Path(options.data).is_dir()
+    glance = _glance(options.data, config) if processes.first and not packed else None
+    data = processes.in_turn(lambda: _with_cameras(options.data))
+    if processes.first and packed:
+        glance = _glance(data, config)
+    if glance is not None:
+        glance()  # the pictures are bad, but their cameras were found nevertheless
+    say = partial(_say, options.data) if processes.first else None
+    reader = training_reader(config, options.model, kept=not options.no_cache, say=say)
+    with Bar("reading pictures", processes.first) as bar:
+        scene = processes.in_turn(
+            lambda: load_scene(data, bar.count, kind=config.kind, scale=config.scale, reader=reader)
+        )
+    config = replace(config, max_side=reader.size.max_side)
+    scene, blurred = _without_blurred(scene, processes)
+    if processes.first:
+        _warn_of_folds(scene)
+    trainer = Trainer(scene, config, processes)
+    checkpoint = checkpoint_path(options.model)
+    if options.resume and checkpoint.exists():
+        load_checkpoint(checkpoint, trainer)
+        if processes.first:
+            print(f"vfr-train: going on after step {trainer.next_step}", file=sys.stderr)
+    preview = _preview(options, scene) if options.preview and processes.first else None
+    figures = _train_steps(trainer, checkpoint, preview)
+    interrupted = figures.pop("interrupted")
+    figures["blurred"] = blurred
+    witnesses = trainer.witness_psnr() if processes.first and not interrupted else None
+    if witnesses is not None:
+        figures["witness_psnr"] = {"patches": witnesses.patches, "whole": witnesses.whole}
+    if processes.first:
+        model = trained_model(trainer, scene, figures)
+        save_model(options.model, model)
+        n_views = config.eval_views if config.eval_views is not None else EVAL_VIEWS[scene.unbounded]
+        if not interrupted and n_views and scene.test.cameras:
+            figures |= _test_figures(model, scene, n_views)
+            save_model(options.model, replace(model, figures=figures))
+        checkpoint.unlink(missing_ok=True)
+        for line in [*trainer.effects.described(), *(witnesses.lines() if witnesses else ())]:
+            print(f"vfr-train: {line}", file=sys.stderr)
+        _report_training(options, figures, interrupted)
+    processes.leave()
+    return 130 if interrupted else 0
+
+
+def _check(options: Any) -> int:
+    from vfr_bake.data import working_size
+    from vfr_bake.data.check.check import check_data
+    from vfr_bake.data.check.page import MARK, check_page
+
+    page = options.html or Path(f"{Path(options.data).resolve().stem}_check.html")
+    ours = page.is_file() and MARK.encode() in page.read_bytes()[:200]
+    check_target(page, options.force or ours, is_file=True)
+    with Bar("looking") as bar:
+        check = check_data(options.data, working_size(options.config), progress=bar.count)
+    write_bytes(page, check_page(check))
+    lines = [f"{options.data}: {printable(line)}" for line in check.lines()]
+    write_result(options.json, check.document() | {"page": str(page)}, "\n".join([*lines, f"see {page}"]))
+    return 0
+
+
+def _glance(data: str, config: TrainConfig) -> Callable[[], None] | None:
+    """Look at some of the pictures, and print what that shows as the first lines of a run.
+
+    If the verdict is bad, print nothing, but return a function that prints these lines later: the estimation
+    of cameras looks at all pictures, and refuses them in one line if they are bad.
+    """
+    from vfr_bake.data import working_size
+    from vfr_bake.data.check.check import check_data
+    from vfr_bake.data.check.verdict import BAD
+
+    if data == "demo":
+        return None
+    try:
+        check = check_data(data, working_size(config), seconds=3, most=GLANCED_AT)
+    except VfrError:  # whatever reads the pictures will report it
+        return None
+
+    def say() -> None:
+        for line in check.lines():
+            _say(data, line)
+
+    if check.verdict == BAD:
+        return say
+    say()
+    return None
+
+
+def _say(data: str, text: str) -> None:
+    print(f"vfr-train: {printable(f'{data}: {text}')}", file=sys.stderr)
+
+
+def _with_cameras(data: str) -> str:
+    """Return the folder to load. Unpack a ZIP first, and estimate the cameras of photographs or a video that
+    have none. What stays as it is keeps its name: `./demo` is a folder, and `demo` the built-in scene."""
+    from vfr_bake.data import needs_cameras, unpacked
+    from vfr_bake.data.poses import added_since, estimate_cameras
+
+    if data == "demo":
+        return data
+    with Bars() as bars:
+        folder = unpacked(data, lambda done, of: bars.count("unpacking", done, of))
+    if folder != Path(data):
+        data = str(folder)
+    if not needs_cameras(data):
+        if added := added_since(folder):
+            named = ", ".join(added[:3]) + (", ..." if len(added) > 3 else "")
+            _say(
+                data,
+                f"pictures that were added after the cameras were estimated are not used: {len(added)} "
+                f"({named}): remove {folder / 'sparse'} to use them",
+            )
+        return data
+    with Bars() as bars:
+        report = estimate_cameras(Path(data), bars.count, partial(_say, data))
+    print(f"vfr-train: {printable(report.summary())}", file=sys.stderr)
+    for name, reason in report.unplaced.items():
+        print(f"vfr-train:   no place for {printable(name)}: {printable(reason)}", file=sys.stderr)
+    return data if report.folder == folder else str(report.folder)
+
+
+def _without_blurred(scene: Scene, processes: Processes) -> tuple[Scene, list[str]]:
+    """Return the scene without blurred training pictures, and the names of these; print which they are."""
+    from vfr_bake.data.quality.sharpness import without_blurred
+
+    with Bar("looking for blur", processes.first) as bar:
+        train, names = without_blurred(scene.train, bar.count)
+    if names and processes.first:
+        print(
+            f"vfr-train: {len(names)} of {len(scene.train.cameras)} training pictures are blurred, compared "
+            f"with the others, and left out: {printable(', '.join(names))}",
+            file=sys.stderr,
+        )
+    return replace(scene, train=train), names
+
+
+def _warn_of_folds(scene: Scene) -> None:
+    from vfr_bake.data.models.folds import torn_views
+
+    try:
+        torn = torn_views(scene.train)
+    except MissingExtraError:
+        return
+    if torn:
+        named = printable(", ".join(f"{first} and {second}" for first, second in torn))
+        print(
+            f"vfr-train: {printable(str(scene.name))}: {named} match, but their cameras are far apart: the "
+            "subject seems to look the same from several sides, and its cameras are folded. Train on a "
+            "folder of the pictures alone to have the cameras estimated anew",
+            file=sys.stderr,
+        )
+
+
+def _preview(options: Any, scene: Scene) -> Preview:
+    from vfr_bake.training.preview import Preview, preview_path
+
+    path = preview_path(options.model)
+    check_target(path, options.force or options.resume, is_file=True)
+    print(f"vfr-train: look at {printable(str(path))}, new every minute", file=sys.stderr)
+    return Preview(scene, path)
+
+
+def _train_steps(trainer: Trainer, checkpoint: Path, preview: Preview | None) -> dict[str, Any]:
+    """Train to the end or to Ctrl-C, with a checkpoint now and then; return the figures to report."""
+    from vfr_bake.training.checkpoint import save_checkpoint
+    from vfr_bake.training.length.expectation import EXPECTED_AT, TIMED_FROM, typical_step
+    from vfr_bake.training.scores.metrics import decibels
+
+    last = None
+    interrupted = False
+    ends: list[float] = []
+    saved = time.monotonic()
+    with Bar("training", trainer.processes.first) as bar:
+        error, n_steps, rays = 0.0, 0, 0.0
+        try:
+            for last in trainer.run():
+                weight = max(0.02, 1 / (n_steps + 1))
+                n_steps += 1
+                if last.loss == last.loss:  # a skipped step reports NaN
+                    error += weight * (last.loss - error)
+                    rays += weight * (last.n_rays - rays)
+                rate = rays * (last.step + 1) / max(last.seconds, 1e-9)
+                skipped = f"  {trainer.n_bad_steps} skipped" if trainer.n_bad_steps else ""
+                bar.share(
+                    last.progress,
+                    f"loss {error:.5f}  PSNR {decibels(error):.2f} dB  {rate:,.0f} rays/s{skipped}",
+                )
+                if TIMED_FROM <= trainer.next_step <= EXPECTED_AT:
+                    ends.append(last.seconds)
+                if trainer.next_step == EXPECTED_AT and len(ends) > 1:
+                    _expect(trainer, typical_step(ends), bar)
+                if preview is not None:
+                    preview.update(trainer)
+                due = time.monotonic() - saved > 60 * trainer.config.checkpoint_minutes
+                if due and trainer.processes.first:
+                    save_checkpoint(checkpoint, trainer)
+                    saved = time.monotonic()
+        except KeyboardInterrupt:
+            interrupted = True
+    if last is None and interrupted:
+        raise KeyboardInterrupt
+    if preview is not None:
+        preview.write(trainer)
+    return {
+        "effects": trainer.effects.figures(),
+        "steps": trainer.next_step,
+        "seconds": round(trainer.seconds, 1),
+        "ended_early": trainer.duration.ended_early,
+        "skipped_steps": trainer.n_bad_steps,
+        "training_psnr": round(decibels(error), 3) if error else None,
+        "interrupted": interrupted,
+    }
+
+
+def _expect(trainer: Trainer, seconds_a_step: float, bar: Bar) -> None:
+    """Print, on a line of its own, what the training is likely to reach."""
+    from vfr_bake.training.length.expectation import expectation
+
+    psnr = trainer.witness_psnr() if trainer.processes.first and trainer.device.type == "cpu" else None
+    if psnr is not None:
+        bar.close()
+        unbounded = trainer.field.config.unbounded
+        length = trainer.pace.steps, trainer.minutes
+        text = expectation(psnr.every, trainer.seconds, seconds_a_step, *length, unbounded)
+        print(f"vfr-train: {text}", file=sys.stderr)
+
+
+def _report_training(options: Any, figures: dict[str, Any], interrupted: bool) -> None:
+    tested = ""
+    if figures.get("test_psnr") is not None:
+        tested = f", {figures['test_psnr']:.2f} dB on {figures['test_views']} test views"
+    skipped = f", {figures['skipped_steps']} skipped (not finite)" if figures["skipped_steps"] else ""
+    flat = ", which is all that pays" if figures["ended_early"] else ""
+    write_result(
+        options.json,
+        figures | {"model": str(options.model)},
+        f"{options.model}: {figures['steps']} steps in {figures['seconds']:.0f} s{flat}{skipped}{tested}"
+        + (" (stopped early)" if interrupted else ""),
+    )
+
+
+def _test_figures(model: Model, scene: Scene, n_views: int) -> dict[str, Any]:
+    import numpy as np
+
+    from vfr_bake.training.scores.evaluation import evaluate
+
+    scores = []
+    n_views = min(n_views, len(scene.test.cameras))
+    with Bar("test views") as bar:
+        for score in evaluate(model, scene.test, n_views, masked=scene.masked):
+            scores.append(score.psnr)
+            bar.count(len(scores), n_views)
+    return {
+        **finite({"test_psnr": float(np.mean(scores))}),
+        "test_views": len(scores),
+        "background": model.background.tolist(),
+    }
