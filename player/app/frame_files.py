@@ -3,7 +3,7 @@ exist already.
 
 A picture carries a key: a digest of the asset, the camera and the settings that it was rendered with. A
 resumed run skips the frames that exist with the right key, so that frames of two different runs, or of an
-incomplete copy and a whole one, are never mixed.
+incomplete copy and a whole one, are never mixed. A video carries a digest of the keys of its frames.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from player.app.options import PICTURES, VIDEO, PlaySettings
-from player.app.video import load_av, write_video
+from player.app.video import load_av, read_video_key, write_video
 from player.asset.asset import Asset
 from player.asset.manifest import MAX_BYTES, NAME
 from player.cameras.camera import Camera
@@ -106,11 +106,23 @@ class Target:
                 "or --resume to go on with a run that was interrupted"
             )
 
-    def finish(self, paths: Sequence[Path], fps: float) -> None:
+    def is_complete(self, key: str) -> bool:
+        """Return whether the video is there already, so that a resumed run has nothing to do.
+
+        Raises ConfigError: there is another video, and no frames of an interrupted run that was to replace
+        it.
+        """
+        if not self.is_video or not self.path.exists() or self.folder.exists():
+            return False
+        if read_video_key(self.path) != key:
+            raise _another(self.path, "a video")
+        return True
+
+    def finish(self, paths: Sequence[Path], fps: float, key: str) -> None:
         """For a video, join its pictures and then remove them; for pictures, do nothing."""
         if not self.is_video:
             return
-        write_video(self.path, (_pixels(path) for path in paths), fps)
+        write_video(self.path, (_pixels(path) for path in paths), fps, key)
         for path in paths:
             path.unlink()
         if not any(self.folder.iterdir()):
@@ -129,6 +141,11 @@ def frame_key(asset: Asset, camera: Camera, settings: PlaySettings) -> str:
     return hashlib.sha256(manifest + json.dumps(facts).encode()).hexdigest()
 
 
+def video_key(keys: Sequence[str], fps: float) -> str:
+    """Return a digest of everything that a video depends on: the keys of its frames and their rate."""
+    return hashlib.sha256(json.dumps([list(keys), fps]).encode()).hexdigest()
+
+
 def unfinished(paths: Sequence[Path], keys: Sequence[str], cameras: Sequence[Camera]) -> list[int]:
     """Return the indices of the frames that do not exist yet. Raises ConfigError for one that shows something
     else."""
@@ -137,11 +154,15 @@ def unfinished(paths: Sequence[Path], keys: Sequence[str], cameras: Sequence[Cam
         if not path.exists():
             missing.append(index)
         elif read_key(path, (camera.width, camera.height)) != key:
-            raise ConfigError(
-                f"{path}: --resume: expected a frame of this asset, these views and these settings, "
-                "got another: add --force instead to render everything anew"
-            )
+            raise _another(path, "a frame")
     return missing
+
+
+def _another(path: Path, what: str) -> ConfigError:
+    return ConfigError(
+        f"{path}: --resume: expected {what} of this asset, these views and these settings, "
+        "got another: add --force instead to render everything anew"
+    )
 
 
 def _pixels(path: Path) -> np.ndarray:

@@ -12,7 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from player.app.frame_files import Target, frame_key, unfinished
+from player.app.frame_files import Target, frame_key, unfinished, video_key
 from player.app.jobs import Done, Job, render_job
 from player.app.options import PlaySettings
 from player.asset.asset import Asset
@@ -62,7 +62,8 @@ def play(
             milliseconds that this one took.
 
     Raises:
-        ConfigError: no camera is chosen, a picture is too large, or sizes differ in a video.
+        ConfigError: no camera is chosen, a picture is too large, sizes differ in a video, or a resumed run
+            finds pictures or a video that show something else.
         MissingExtraError: a video without PyAV, a cluster without dask.distributed, or numba where it is
             asked for and does not run.
         OutputError: a file exists already, or cannot be written.
@@ -87,7 +88,11 @@ def play(
         raise ConfigError(f"--frames: expected at least one of the {len(cameras)} views, got none")
     _check_sizes(chosen, target, say)
     keys = [frame_key(asset, camera, settings) for camera in chosen]
-    missing = unfinished(paths, keys, chosen) if settings.resume else range(len(chosen))
+    film = video_key(keys, settings.fps)
+    if is_complete := settings.resume and target.is_complete(film):
+        missing = []
+    else:
+        missing = unfinished(paths, keys, chosen) if settings.resume else range(len(chosen))
     jobs = [
         Job(
             n,
@@ -115,7 +120,8 @@ def play(
         write_bytes(paths[missing[frame.index]], frame.data)
         done.append(replace(frame, data=b""))  # the files of a long film would fill the memory
         advance(len(done), len(jobs), frame.milliseconds)
-    target.finish(paths, settings.fps)
+    if not is_complete:
+        target.finish(paths, settings.fps, film)
     figures = _figures(asset, chosen[0], done, settings)
     return Played(figures, len(chosen) - len(done), time.perf_counter() - begin)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Iterable
 from fractions import Fraction
 from pathlib import Path
@@ -10,8 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from player.errors import MissingExtraError, OutputError
-from player.files.files import new_file
+from player.errors import FormatError, MissingExtraError, OutputError
+from player.files.files import new_file, open_file
+from player.files.images import KEY
 
 QUALITY = 18
 """x264's constant rate factor: 0 is lossless, 18 looks lossless, 23 is x264's default."""
@@ -29,7 +31,7 @@ def load_av() -> Any:
     return av
 
 
-def write_video(path: Path, pictures: Iterable[np.ndarray], fps: float) -> None:
+def write_video(path: Path, pictures: Iterable[np.ndarray], fps: float, key: str) -> None:
     """Write an MP4; the file appears under its name when it is complete.
 
     Args:
@@ -37,6 +39,7 @@ def write_video(path: Path, pictures: Iterable[np.ndarray], fps: float) -> None:
         pictures: [h, w, 3] uint8 each, all of one size. An odd width or height is extended by a copy of the
             last column or row: H.264 stores colour for two by two pixels.
         fps: frames a second.
+        key: what the video shows (`player.app.frame_files`), stored in it as its comment.
 
     Raises:
         MissingExtraError: PyAV is not installed.
@@ -46,10 +49,25 @@ def write_video(path: Path, pictures: Iterable[np.ndarray], fps: float) -> None:
     with new_file(path) as temporary:
         try:
             with av.open(str(temporary), "w", options={"movflags": "faststart"}) as container:
+                container.metadata["comment"] = f"{KEY}={key}"
                 _encode(av, container, pictures, fps)
         except (av.FFmpegError, OSError) as error:
             reason = getattr(error, "strerror", None) or str(error)
             raise OutputError(f"{path}: cannot write: {reason}") from error
+
+
+def read_video_key(path: Path) -> str | None:
+    """Return the key that a video was written with; None if it has none, or if it is no video.
+
+    Raises MissingExtraError.
+    """
+    av = load_av()
+    try:
+        with open_file(path, "a video", sys.maxsize) as file, av.open(file, format="mp4") as container:
+            comment = container.metadata.get("comment", "")
+    except (av.FFmpegError, OSError, FormatError):
+        return None
+    return comment.removeprefix(f"{KEY}=") if comment.startswith(f"{KEY}=") else None
 
 
 def _encode(av: Any, container: Any, pictures: Iterable[np.ndarray], fps: float) -> None:

@@ -305,9 +305,36 @@ def test_a_video_shows_the_frames_at_the_paths_rate(
 
 
 @pytest.mark.extra
+def test_a_resumed_video_that_is_complete_is_kept(
+    shells_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The same command again renders nothing. A video of other views, settings or rates, or one that this
+    program has not made, is refused, unless frames of an interrupted run that was to replace it are there."""
+    target = tmp_path / "turn.mp4"
+    command = [*trained(shells_folder), "--output", str(target)]
+    assert cli.main([*command, "--resume"]) == 0
+    made = target.read_bytes(), target.stat().st_mtime_ns
+    capsys.readouterr()
+    assert cli.main([*command, "--resume"]) == 0
+    assert "0 pictures (5 were there already) of 48x40, nothing left to render" in capsys.readouterr().out
+    for options in (["--samples", "2"], ["--frames", "1:3"], ["--fps", "7"]):
+        assert cli.main([*command, "--resume", *options]) == 1
+        assert f"{target}: --resume: expected a video of this asset, these views" in capsys.readouterr().err
+    assert (target.read_bytes(), target.stat().st_mtime_ns) == made
+    assert [path.name for path in tmp_path.iterdir()] == ["turn.mp4"]
+    target.write_bytes(b"mine")
+    assert cli.main([*command, "--resume"]) == 1 and target.read_bytes() == b"mine"
+    frames = tmp_path / "turn.mp4.frames"
+    assert cli.main([*trained(shells_folder), "--output", str(frames), "--frames", "1:3"]) == 0
+    assert cli.main([*command, "--resume"]) == 0
+    assert len(decode(target)) == 5 and not frames.exists()
+    assert cli.main([*command, "--resume"]) == 0 and "0 pictures (5" in capsys.readouterr().out
+
+
+@pytest.mark.extra
 def test_plain_colours_of_a_video_are_right(tmp_path: Path) -> None:
     colours = [(255, 255, 255), (0, 0, 0), (200, 30, 30), (30, 200, 30), (30, 30, 200)]
-    write_video(tmp_path / "a.mp4", [np.full((32, 32, 3), c, np.uint8) for c in colours], 29.97)
+    write_video(tmp_path / "a.mp4", [np.full((32, 32, 3), c, np.uint8) for c in colours], 29.97, "key")
     for frame, colour in zip(decode(tmp_path / "a.mp4"), colours, strict=True):
         assert np.abs(frame.mean(axis=(0, 1)) - colour).max() < 4
 
@@ -324,7 +351,7 @@ def test_videos_that_cannot_be(
     assert cli.main([str(shells_folder), "--cameras", str(mixed), "--output", str(target)]) == 1
     assert "expected views of one size for a video, got [(20, 20), (48, 40)]" in capsys.readouterr().err
     with pytest.raises(OutputError, match=r"turn\.mp4: cannot write: "):
-        write_video(target, [np.zeros((8, 40_000, 3), np.uint8)], 30)
+        write_video(target, [np.zeros((8, 40_000, 3), np.uint8)], 30, "key")
     monkeypatch.setitem(sys.modules, "av", None)
     assert cli.main([*trained(shells_folder), "--output", str(target)]) == 1
     assert "pip install 'vfr-bake[video]'; or write pictures: --output DIR" in capsys.readouterr().err
