@@ -11,7 +11,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from player.app.commands import run, write_result
+from player.app.commands import check_result, run, write_result
 from player.app.option_types import DEMO
 from player.app.options import PlaySettings, given, parse, settings_of
 from player.errors import ConfigError, FormatError, VfrError
@@ -34,6 +34,8 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _run(arguments: argparse.Namespace) -> int:
+    inputs = [arguments.asset, *([] if arguments.cameras is None else [arguments.cameras])]
+    check_result(arguments.json, inputs, arguments.output)
     if arguments.check:
         return _check(arguments)
     if arguments.info:

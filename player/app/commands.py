@@ -8,13 +8,13 @@ import json
 import os
 import select
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, TextIO
 
-from player.errors import VfrError
-from player.files.files import write_bytes
+from player.errors import OutputError, VfrError
+from player.files.files import check_target, write_bytes
 from player.terminal import printable
 
 READER_GONE = 141
@@ -59,6 +59,33 @@ def run(name: str, command: Callable[[], int]) -> int:
     except KeyboardInterrupt as stop:
         _say(f"{name}: {'; '.join(['interrupted', *map(str, stop.args)])}")
         return 130
+
+
+def check_result(target: str | Path | None, inputs: Iterable[Path], output: Path | None = None) -> None:
+    """Check the file of `write_result` before long work.
+
+    Args:
+        target: a file, "-" for standard output, or None for no JSON.
+        inputs: files and folders that the command reads; neither they nor anything in them is replaced.
+        output: what else the command writes.
+
+    Raises OutputError: the file cannot be written, is or lies in an input, or is the output.
+
+    >>> check_result("out/manifest.json", [Path("out")])
+    Traceback (most recent call last):
+    player.errors.OutputError: out/manifest.json: --json: expected a file outside out, which is read
+    """
+    if target is None or str(target) == "-":
+        return
+    path = Path(target)
+    check_target(path, force=True, is_file=True)
+    place = path.resolve()
+    for read in inputs:
+        if place.is_relative_to(read.resolve()):
+            where = "another file than" if read.is_file() else "a file outside"
+            raise OutputError(f"{path}: --json: expected {where} {read}, which is read")
+    if output is not None and place == output.resolve():
+        raise OutputError(f"{path}: --json: expected another file than --output")
 
 
 def write_result(target: str | Path | None, figures: dict[str, Any], sentence: str | None) -> None:

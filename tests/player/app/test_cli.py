@@ -79,6 +79,33 @@ def test_json_on_stdout_and_slices(
         assert got["march"] == "numpy" and got["n_fetches"] == 0
 
 
+def test_json_replaces_no_input_and_is_checked_first(
+    shells_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """--json never replaces the asset, the cameras or the pictures, and a file that cannot be written is
+    refused before anything is rendered."""
+    cameras, view = tmp_path / "cameras.json", tmp_path / "view.png"
+    shutil.copy(shells_folder / "cameras.json", cameras)
+    (tmp_path / "file").write_text("mine")
+    manifest = shells_folder / "manifest.json"
+    before = {path: path.read_bytes() for path in (manifest, cameras)}
+    asset, files = str(shells_folder), ["--cameras", str(cameras), "--frames", "0", "--output", str(view)]
+    for options, target, message in (
+        (["--info"], manifest, f"--json: expected a file outside {asset}, which is read"),
+        (["--check"], manifest, f"--json: expected a file outside {asset}, which is read"),
+        (files, cameras, f"--json: expected another file than {cameras}, which is read"),
+        (files, view, "--json: expected another file than --output"),
+        (files, tmp_path / "file" / "x.json", "cannot write: "),
+        (files, tmp_path, "expected a file to write, got a folder"),
+    ):
+        assert cli.main([asset, *options, "--json", str(target)]) == 1
+        printed = capsys.readouterr()
+        assert printed.err.startswith(f"vfr-play: error: {target}: {message}") and not printed.out
+    assert {path: path.read_bytes() for path in before} == before and not view.exists()
+    assert cli.main([asset, *files, "--json", str(tmp_path / "play.json")]) == 0
+    assert cli.main([asset, *files, "--force", "--json", str(tmp_path / "play.json")]) == 0
+
+
 @pytest.mark.parametrize(
     ("background", "mode", "corner"),
     [("white", "RGB", (255,) * 3), ("black", "RGB", (0,) * 3), ("10,200,30", "RGB", (10, 200, 30)),
