@@ -113,7 +113,7 @@ class Renderer:
             self._block_bounds = bounds_compiled.block_bounds
             self._directions = pixels_compiled.directions
         self.asset = asset
-        self._head = Head(asset.path("head.onnx"), asset.manifest.n_channels, self.march == "numba")
+        self._head = Head.of(asset, self.march == "numba")
         self._model_from_world = np.linalg.inv(asset.world_from_model)
         self._pool, self._process = self._new_pool(), os.getpid()
 

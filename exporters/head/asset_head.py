@@ -24,7 +24,7 @@ import numpy as np
 from exporters.extras import needs
 from player.asset.asset import Asset
 from player.errors import FormatError, ParityError
-from player.head.head import Head, read_head_file
+from player.head.head import Head, asset_head
 
 TOLERANCE = 1e-6
 """Largest allowed difference of rgb from the asset's own head. Both compute the same graph on numbers that
@@ -68,9 +68,9 @@ def head_bytes(asset: Asset, decode: bool = False, where: str = "head.onnx") -> 
     """
     with needs("ONNX", "the package onnx"):
         import onnx
-    data, arrays = read_head_file(asset.path("head.onnx"), asset.manifest.n_channels)
+    data = asset.read("head.onnx")
     model = onnx.load_from_string(data)
-    if arrays.may_saturate:
+    if asset_head(asset).may_saturate:
         _make_weights_unsigned(onnx, model)
     if decode:
         _put_decode_in_front(onnx, model, asset.manifest.n_channels)
@@ -143,7 +143,7 @@ def _compare(asset: Asset, data: bytes, decode: bool, where: str) -> float:
     options.log_severity_level = 3
     options.intra_op_num_threads = 1
     session = onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
-    head = Head(asset.path("head.onnx"), asset.manifest.n_channels)
+    head = Head.of(asset)
     worst = 0.0
     for label, features, codes, weights, dirs in comparisons(asset.manifest.n_channels):
         if decode and codes is None:

@@ -128,7 +128,7 @@ def asset_volume(
 def _colours(asset: Asset, index: np.ndarray) -> np.ndarray:
     """Return the colours [n, 3] uint8 that the head gives the features at each vertex, as if the vertex alone
     made the whole pixel."""
-    head = Head(asset.path("head.onnx"), asset.manifest.n_channels)
+    head = Head.of(asset)
     grid, densities = asset.grid, asset.arrays.densities
     codes, vertices = densities.values[0][:, 0], densities.pyramid.vertices[0]
 

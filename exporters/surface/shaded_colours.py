@@ -83,7 +83,7 @@ class _Shader:
         self._asset = asset
         self._grid = replace(asset.grid, contracted=False)  # space is not contracted where surfaces are made
         self._march = choose_march("auto")[1].march
-        self._head = Head(asset.path("head.onnx"), asset.manifest.n_channels)
+        self._head = Head.of(asset)
         self._model_from_world = np.linalg.inv(asset.world_from_model)
         self._pool = pool
 

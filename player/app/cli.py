@@ -183,7 +183,7 @@ def _check(arguments: argparse.Namespace) -> int:
     from player.asset.asset import Asset, checksums, read_manifest
     from player.asset.folder import check_total
     from player.files.memory import allowed_bytes
-    from player.head.head import read_head_file
+    from player.head.head import asset_head
 
     manifest = read_manifest(arguments.asset)
     check_total(arguments.asset, manifest.files, allowed_bytes(arguments.max_memory))
@@ -201,7 +201,7 @@ def _check(arguments: argparse.Namespace) -> int:
             asset = Asset.open(arguments.asset, max_memory=arguments.max_memory)
             if asset.missing is not None:
                 raise FormatError(asset.missing)
-            read_head_file(asset.path("head.onnx"), manifest.n_channels)
+            asset_head(asset)
         except VfrError as found:
             error = found
     write_result(arguments.json, {"ok": error is None, "files": results}, None)

@@ -14,7 +14,7 @@ from player.asset.asset import Asset
 from player.asset.manifest import Manifest
 from player.asset.pyramid import PyramidValues
 from player.cameras.views import asset_cameras
-from player.head.head import read_head_file
+from player.head.head import asset_head
 from player.march.contracted import MAX_SPEED
 from player.terminal import printable
 
@@ -40,7 +40,6 @@ CONTENT = {
 def facts(asset: Asset) -> dict[str, Any]:
     """Return the facts that `vfr-play --info --json` writes."""
     m = asset.manifest
-    _, head = read_head_file(asset.path("head.onnx"), m.n_channels)
     return {
         "bytes": {name: entry.bytes for name, entry in sorted(m.files.items())},
         "bytes_total": sum(entry.bytes for entry in m.files.values()),
@@ -52,7 +51,7 @@ def facts(asset: Asset) -> dict[str, Any]:
         "missing": asset.missing,
         "parts": [{"file": part.file, "bytes": part.bytes, "adds": what_it_adds(part)} for part in m.parts],
         "levels": {grid: _levels(getattr(asset.arrays, grid)) for grid in ("densities", "features")},
-        "head_parameters": head.n_parameters,
+        "head_parameters": asset_head(asset).n_parameters,
         "n_cameras": len(asset_cameras(asset)),
         "world_box": _world_box(asset),
         "world_units_per_model_unit": asset.scale,

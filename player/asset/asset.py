@@ -12,7 +12,7 @@ import numpy as np
 
 from player.asset.arranging import write_parts
 from player.asset.check_bricks import check_level
-from player.asset.folder import check_files, check_size, check_sum, file_digest
+from player.asset.folder import check_files, check_size, check_sum, file_digest, read_checked
 from player.asset.grid import SparseGrid, build_grid, most_samples
 from player.asset.manifest import (
     MAX_BYTES,
@@ -26,6 +26,7 @@ from player.asset.manifest import (
 from player.asset.parts import DTYPES, PartsReader
 from player.asset.pyramid import PyramidValues
 from player.asset.sections import MAX_ROWS, Grid
+from player.asset.target import check_asset_target
 from player.asset.version_3.unpacking import read_version_3
 from player.errors import ConfigError, FormatError
 from player.files.files import new_folder, read_bytes
@@ -87,6 +88,7 @@ class Asset:
     """An opened asset with its values decoded; `asset.grid` has them arranged for the march."""
 
     folder: Path
+    """Absolute, so that the asset can still be read when the process has changed its folder."""
     manifest: Manifest
     arrays: GridArrays
     n_parts: int = 0
@@ -108,8 +110,9 @@ class Asset:
         Args:
             folder: the asset's folder; its files must be regular files inside it.
             verify: first compare the checksum of every file, which reads every byte, and raise if any part
-                cannot be decoded. If False, only the checksums of the parts are compared, and a part after
-                the first that is missing, cut short, changed or broken is no error: `asset.missing` says so.
+                cannot be decoded. If False, a file is compared when it is read: now the parts, later the head
+                and the cameras. A part after the first that is missing, cut short, changed or broken is then
+                no error: `asset.missing` says so.
             max_memory: gigabytes that the asset may take, unpacked and arranged for marching. If None, half
                 of what the machine has.
             parts: number of parts to read, 1 or more: the fewer, the coarser the picture and the sooner it
@@ -164,8 +167,13 @@ class Asset:
         return self.folder / name
 
     def read(self, name: str) -> bytes:
-        """Return the content of one of the asset's files. Raises FormatError."""
-        return read_bytes(self.path(name), "a file of an asset", self.manifest.files[name].bytes, self.folder)
+        """Return the content of one of the asset's files, for example `asset.read("head.onnx")`.
+
+        Raises FormatError: the manifest lists no such file, or it is none; IntegrityError: it is cut short,
+        or not the one that the manifest lists, for example because another asset has taken its place.
+        """
+        path = self.path(name)
+        return read_checked(self.folder, path.name, self.manifest.files[name])
 
     def verify(self) -> None:
         """Compare every file with its checksum. Raises IntegrityError that names the first that differs."""
@@ -211,9 +219,9 @@ class _Opening:
     """An asset that is being opened, part by part."""
 
     def __init__(self, folder: Path, verify: bool, max_memory: float | None) -> None:
-        self._folder, self._allowed = folder, allowed_bytes(max_memory)
-        self._verify = verify
+        self._verify, self._allowed = verify, allowed_bytes(max_memory)
         self.manifest = read_manifest(folder)
+        self._folder = folder = folder.absolute()
         may_lack = set() if verify else {part.file for part in self.manifest.parts[1:]}
         needed = {name: entry for name, entry in self.manifest.files.items() if name not in may_lack}
         check_files(folder, needed, self._allowed)
@@ -287,15 +295,16 @@ def write_asset(
         head: bytes of `head.onnx`.
         mesh: bytes of `mesh.ply`, world frame.
         cameras: bytes of `cameras.json`, world frame.
-        force: replace a folder that exists.
+        force: replace a folder that exists, if it holds an asset and nothing else.
         finish: called with the temporary folder of the complete asset, which can already be played. It
             returns further files to add, content by name. If it raises, nothing is left on disk.
 
     Raises:
         FormatError: the arrays contradict the manifest, or hold values that its quantization steps cannot
             reach.
-        OutputError: the folder exists, or the disk is full.
+        OutputError: the folder exists, or holds something else than an asset; or the disk is full.
     """
+    check_asset_target(folder, force)
     arrays.check(manifest)
     n_before = len(head) + len(cameras)
     parts = write_parts(arrays.densities, arrays.features, manifest, n_before, len(mesh))

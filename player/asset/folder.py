@@ -8,7 +8,7 @@ from pathlib import Path
 
 from player.asset.manifest import FileEntry
 from player.errors import FormatError, IntegrityError
-from player.files.files import file_size, open_file
+from player.files.files import file_size, open_file, read_bytes
 from player.files.memory import check_memory
 
 MAX_HEAD_BYTES = 64 << 20
@@ -48,10 +48,19 @@ def check_size(folder: Path, name: str, entry: FileEntry) -> None:
 
 def check_sum(folder: Path, name: str, entry: FileEntry) -> None:
     """Raise IntegrityError unless the file has the checksum in the manifest."""
-    compare_sums(folder / name, entry, file_digest(folder / name, entry.bytes, folder))
+    _compare_sums(folder / name, entry, file_digest(folder / name, entry.bytes, folder))
 
 
-def compare_sums(path: Path, entry: FileEntry, digest: str) -> None:
+def read_checked(folder: Path, name: str, entry: FileEntry) -> bytes:
+    """Return the content of a file of an asset, which has the size and the checksum in the manifest. Raises
+    FormatError as `check_size`, and IntegrityError."""
+    check_size(folder, name, entry)
+    data = read_bytes(folder / name, "a file of an asset", entry.bytes, folder)
+    _compare_sums(folder / name, entry, hashlib.sha256(data).hexdigest())
+    return data
+
+
+def _compare_sums(path: Path, entry: FileEntry, digest: str) -> None:
     """Raise IntegrityError unless `digest`, that of the file at `path`, is the one in the manifest."""
     if digest != entry.sha256:
         raise IntegrityError(f"{path}: sha256: expected {entry.sha256[:16]}..., got {digest[:16]}...")

@@ -7,7 +7,6 @@ are the vertices. No more than that is ever decoded, whatever a file holds.
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from operator import itemgetter
@@ -18,14 +17,13 @@ import numpy as np
 
 from player.asset.bricks import bricks_per_axis, with_corners
 from player.asset.coder.lanes import Neighbours
-from player.asset.folder import check_size, compare_sums
+from player.asset.folder import read_checked
 from player.asset.manifest import Manifest
 from player.asset.pyramid import NO_BRICKS, Pyramid, PyramidValues, values_of
 from player.asset.sections import Grid, Part, Section
 from player.asset.structure import decode_structure
 from player.asset.symbols import LevelRows, decode_level, level_rows
 from player.errors import FormatError
-from player.files.files import read_bytes
 from player.files.memory import check_memory
 from player.threads import default_threads
 
@@ -273,10 +271,8 @@ class PartsReader:
 
     def _sections(self, part: Part) -> list[StoredSection]:
         """Read the sections of a part, and compare its file with the checksum."""
-        path, entry = self._folder / part.file, self._manifest.files[part.file]
-        check_size(self._folder, part.file, entry)
-        data = read_bytes(path, "a part of an asset", entry.bytes, self._folder)
-        compare_sums(path, entry, hashlib.sha256(data).hexdigest())
+        path = self._folder / part.file
+        data = read_checked(self._folder, part.file, self._manifest.files[part.file])
         first, found = 0, []
         for section in part.sections:
             end = first + section.bytes

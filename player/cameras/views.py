@@ -8,7 +8,7 @@ from player.asset.asset import Asset
 from player.cameras import colmap
 from player.cameras.camera import Camera
 from player.cameras.nerfstudio import is_camera_path, path_cameras, path_frame_rate
-from player.cameras.transforms import parse_transforms, read_cameras, transforms_cameras
+from player.cameras.transforms import parse_transforms, transforms_cameras
 from player.errors import FormatError
 from player.files.json_files import parse_json, read_json
 
@@ -44,13 +44,15 @@ def read_views(path: str | Path, size: tuple[int, int] | None = None) -> list[Ca
 
 def asset_cameras(asset: Asset) -> list[Camera]:
     """Read the training cameras that an asset holds, in the WORLD frame. Raises FormatError if they are
-    damaged.
+    damaged, or not those that the manifest lists.
 
     >>> [camera.name for camera in asset_cameras(Asset.open("out/"))][:2]
     ['./test/r_0', './test/r_1']
     """
     width, height = asset.manifest.view_size
-    return read_cameras(asset.path("cameras.json"), (width, height))
+    where = str(asset.path("cameras.json"))
+    document = parse_transforms(asset.read("cameras.json"), where)
+    return transforms_cameras(document, where, [(width, height)] * len(document["frames"]))
 
 
 def frame_rate(path: str | Path) -> float | None:

@@ -7,13 +7,11 @@ Each of these is imported only when a head that needs it is opened, so that `vfr
 from __future__ import annotations
 
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 
-from player.asset.folder import MAX_HEAD_BYTES
+from player.asset.asset import Asset
 from player.errors import FormatError
-from player.files.files import read_bytes
 from player.head.graph import HeadArrays, read_head
 
 CHUNK = 2048
@@ -30,21 +28,29 @@ class Head:
     idle.
     """
 
-    def __init__(self, path: Path, n_channels: int, compiled: bool = False) -> None:
-        """Open the head.
+    def __init__(
+        self, data: bytes, n_channels: int, compiled: bool = False, where: str = "head.onnx"
+    ) -> None:
+        """Open a head.
 
         Args:
-            path: the file of the head.
+            data: the bytes of its file.
             n_channels: number of features of a pixel.
             compiled: let numba run the head if it is in 8 bits (`player.head.compiled`). onnxruntime runs a
                 head in float32, faster than numba would.
+            where: the file's name in error messages.
 
         Raises:
-            FormatError: as `read_head_file`.
+            FormatError: the bytes are not the graph of a head that takes `n_channels` features.
         """
-        data, arrays = read_head_file(path, n_channels)
-        self._path = path
+        self._where, arrays = where, _checked(data, n_channels, where)
         self._run = _compile(arrays) if compiled and arrays.form.in_8_bits else _open_session(data, arrays)
+
+    @classmethod
+    def of(cls, asset: Asset, compiled: bool = False) -> Head:
+        """Open the head of an asset. Raises FormatError as `asset_head`."""
+        name = str(asset.path("head.onnx"))
+        return cls(asset.read("head.onnx"), asset.manifest.n_channels, compiled, name)
 
     def __call__(self, features: np.ndarray, dirs: np.ndarray) -> np.ndarray:
         """Compute the colours of n pixels.
@@ -64,21 +70,27 @@ class Head:
             part = slice(start, start + CHUNK)
             rgb[part] = self._run(features[part], dirs[part])
         if not np.isfinite(rgb).all():
-            raise FormatError(f"{self._path}: rgb: expected {len(rgb)} finite colours, got NaN or infinity")
+            raise FormatError(f"{self._where}: rgb: expected {len(rgb)} finite colours, got NaN or infinity")
         return rgb
 
 
-def read_head_file(path: Path, n_channels: int) -> tuple[bytes, HeadArrays]:
-    """Read an asset's head, as bytes and as checked numbers.
+def asset_head(asset: Asset) -> HeadArrays:
+    """Return the numbers of an asset's head.
 
     Raises:
-        FormatError: the file is not the graph of a head that takes `n_channels` features.
+        FormatError: the file is not the graph of a head that takes the asset's channels; IntegrityError: it
+            is not the file that the manifest lists.
     """
-    data = read_bytes(path, "a head", MAX_HEAD_BYTES, path.parent)
-    arrays = read_head(data, str(path))
+    return _checked(asset.read("head.onnx"), asset.manifest.n_channels, str(asset.path("head.onnx")))
+
+
+def _checked(data: bytes, n_channels: int, where: str) -> HeadArrays:
+    arrays = read_head(data, where)
     if arrays.n_channels != n_channels:
-        raise FormatError(f"{path}: features: expected float [n, {n_channels}], got [n, {arrays.n_channels}]")
-    return data, arrays
+        raise FormatError(
+            f"{where}: features: expected float [n, {n_channels}], got [n, {arrays.n_channels}]"
+        )
+    return arrays
 
 
 def _compile(arrays: HeadArrays) -> Run:

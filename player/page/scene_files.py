@@ -22,7 +22,7 @@ from player.asset.asset import Asset
 from player.asset.manifest import NAME, VERSION, FileEntry, manifest_bytes
 from player.cameras.views import asset_cameras
 from player.errors import ConfigError, FormatError
-from player.head.head import read_head_file
+from player.head.head import asset_head
 from player.page.head_data import head_data
 
 MANIFEST = NAME
@@ -45,8 +45,7 @@ def scene_files(asset: Asset) -> dict[str, bytes]:
             f"{asset.folder}: parts: expected an asset that was opened with all of its "
             f"{len(manifest.parts)}, got {asset.n_parts}"
         )
-    _, arrays = read_head_file(asset.path("head.onnx"), manifest.n_channels)
-    head = head_data(arrays)
+    head = head_data(asset_head(asset))
     files = {"cameras.json": _cameras(asset), "head.json": head.description, "head.bin": head.numbers}
     if manifest.parts:
         files |= {part.file: asset.read(part.file) for part in manifest.parts}

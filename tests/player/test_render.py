@@ -79,7 +79,7 @@ def test_picture_is_the_naive_loop(module: str, asset: Asset, scene: Scene, came
     frame = render(asset, camera, background=(0.25, 0.5, 1.0), march=module)
     model = camera.transformed(np.linalg.inv(asset.world_from_model))
     rays_o, rays_d = model.rays()
-    head = Head(asset.path("head.onnx"), 4)
+    head = Head.of(asset)
     for pixel in range(0, camera.width * camera.height, 37):
         ray = march_ray(scene, rays_o[pixel], rays_d[pixel], 5)
         at = divmod(pixel, camera.width)
@@ -203,7 +203,7 @@ def test_too_large_and_other_settings(asset: Asset, camera: Camera, monkeypatch:
 
 
 def test_head_is_the_formula_in_any_number_of_pixels(asset: Asset) -> None:
-    head = Head(asset.path("head.onnx"), 4)
+    head = Head.of(asset)
     (w, v), rng = head_arrays(), np.random.default_rng(1)
     features = rng.uniform(-100, 100, (CHUNK * 2 + 1, 4)).astype(np.float32)
     dirs = rng.normal(size=(len(features), 3))
@@ -213,16 +213,14 @@ def test_head_is_the_formula_in_any_number_of_pixels(asset: Asset) -> None:
         np.testing.assert_allclose(head(features[:n], dirs[:n]), expected[:n], rtol=0, atol=1e-6)
 
 
-def test_heads_that_do_not_fit(tmp_path: Path) -> None:
-    path = tmp_path / "head.onnx"
+def test_heads_that_do_not_fit() -> None:
     for data, message in (
         (b"not onnx", "expected an ONNX graph"),
         (b"", "expected an ONNX graph"),
         (head_bytes(5), r"features: expected float \[n, 4\], got \[n, 5\]"),
     ):
-        path.write_bytes(data)
         with pytest.raises(FormatError, match=message) as caught:
-            Head(path, 4)
+            Head(data, 4)
         assert "\n" not in str(caught.value)
 
 

@@ -136,7 +136,7 @@ def test_onnxruntime_calls_nobody(tmp_path: Path) -> None:
     (tmp_path / "head.onnx").write_bytes(head_bytes(4))
     code = (
         "import os, sys, time; from pathlib import Path; from player.head.head import Head\n"
-        f"Head(Path({str(tmp_path / 'head.onnx')!r}), 4); time.sleep(0.5)\n"
+        f"Head(Path({str(tmp_path / 'head.onnx')!r}).read_bytes(), 4); time.sleep(0.5)\n"
         "print('onnxruntime' in sys.modules, len(os.listdir('/proc/self/task')))"
     )
     alone = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}

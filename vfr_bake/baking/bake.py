@@ -25,9 +25,9 @@ from exporters.shapes.mesh import TriangleMesh
 from exporters.surface.asset_surface import Removed
 from player.asset.asset import Asset, GridArrays, write_asset
 from player.asset.manifest import Manifest
+from player.asset.target import check_asset_target
 from player.cameras.transforms import write_cameras
 from player.errors import ConfigError
-from player.files.files import check_target
 from player.files.memory import give_back
 from player.head.head import Head
 from player.progress import Report
@@ -104,7 +104,7 @@ def bake(model: Model, folder: Path, config: BakeConfig, report: Report, force: 
     nothing is visible, that the baked grid does not show what the model shows, or that the result misses
     `max_loss_db`, `max_mb` or `target_ms`.
     """
-    check_target(folder, force)
+    check_asset_target(folder, force)
     check_bakeable(model, config)
     work = _Bake(model, config, report)
     return work.run(folder, force)
@@ -414,7 +414,7 @@ class _Bake:
     def _judge(self, asset: Asset, n_bytes: dict[str, int], name: str) -> BakeReport:
         """Play the written files, which have the sizes `n_bytes`, and report the result. Raises TrainingError
         if it misses a limit that was asked for."""
-        head = Head(asset.path("head.onnx"), asset.manifest.n_channels)
+        head = Head.of(asset)
         last = self.held_out.measure("files", asset.grid, head, self.n_fetches)
         megabytes = sum(n_bytes.values()) / 1e6
         timed = self.config.target_ms is not None

@@ -26,7 +26,7 @@ from player.asset.asset import Asset
 from player.asset.manifest import AGREEMENT, Manifest
 from player.cameras.camera import Camera
 from player.files.images import to_8_bit
-from player.head.head import read_head_file
+from player.head.head import asset_head
 from player.march.interpolation import Quality
 from player.render import Renderer
 from vfr_bake.baking.held_out import SEED, views_between
@@ -120,7 +120,7 @@ class _Played:
         self._renderer, self._asset, self._views, self._error = renderer, renderer.asset, views, error
         self._exact, self._n_exact = self._pictures("exact")
         self._errors = self._off(self._exact)
-        self._head = read_head_file(self._asset.path("head.onnx"), self._manifest.n_channels)[1].n_parameters
+        self._head = asset_head(self._asset).n_parameters
 
     @property
     def _manifest(self) -> Manifest:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -17,6 +18,7 @@ from exporters.head.asset_head import TOLERANCE, comparisons, head_bytes
 from exporters.head.onnx_head import head_onnx
 from exporters.head.ranges import activation_ranges
 from player.asset.asset import Asset
+from player.asset.manifest import FileEntry
 from player.errors import MissingExtraError, ParityError
 from player.head.head import Head
 from tests.exporters.head.test_onnx_head import inputs, random_head
@@ -27,10 +29,16 @@ def with_real_head(request: pytest.FixtureRequest, opened: Asset, tmp_path: Path
     """Return a copy of the asset with a head of random weights as the bake writes it, for four channels."""
     weights = random_head(n_channels=4)
     ranges = activation_ranges(weights, *inputs(500, 4)) if request.param == "int8" else None
-    folder = tmp_path / "asset"
-    shutil.copytree(opened.folder, folder)
-    (folder / "head.onnx").write_bytes(head_onnx(weights, ranges))
-    return replace(opened, folder=folder)
+    return with_head(opened, tmp_path / "asset", head_onnx(weights, ranges))
+
+
+def with_head(asset: Asset, folder: Path, data: bytes) -> Asset:
+    """Return a copy of an asset in a new folder, with the head in `data`."""
+    shutil.copytree(asset.folder, folder)
+    (folder / "head.onnx").write_bytes(data)
+    entry = FileEntry(len(data), hashlib.sha256(data).hexdigest())
+    manifest = replace(asset.manifest, files=asset.manifest.files | {"head.onnx": entry})
+    return replace(asset, folder=folder, manifest=manifest)
 
 
 def notes(data: bytes) -> dict[str, str]:
@@ -57,7 +65,7 @@ def test_decode_takes_any_number_of_pixels_and_fetches(with_real_head: Asset) ->
     session = onnxruntime.InferenceSession(
         head_bytes(with_real_head, True), providers=["CPUExecutionProvider"]
     )
-    head = Head(with_real_head.path("head.onnx"), 4)
+    head = Head.of(with_real_head)
     is_int8 = notes(head_bytes(with_real_head, True))["vfr.layers"] == "int8"
     random = np.random.default_rng(1)
     for n, k in ((0, 5), (1, 1), (7, 5), (300, 12)):

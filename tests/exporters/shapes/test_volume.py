@@ -137,7 +137,7 @@ def _sigmoid_head(asset: Asset, rows: np.ndarray, dirs: np.ndarray) -> np.ndarra
     from player.head.head import Head
 
     features = asset.arrays.features.values[0][rows].astype(np.float32)
-    return Head(asset.path("head.onnx"), 4)(features, dirs.astype(np.float32))
+    return Head.of(asset)(features, dirs.astype(np.float32))
 
 
 def test_vdb_holds_every_number_and_the_same_bytes_again() -> None:

@@ -16,7 +16,9 @@ import pytest
 from player.asset.asset import Asset, GridArrays, checksums, read_manifest, write_asset
 from player.asset.manifest import FILES, MAX_BYTES, Manifest, manifest_bytes, parse_manifest
 from player.asset.pyramid import Bricks, Pyramid, PyramidValues
+from player.cameras.views import asset_cameras
 from player.errors import FormatError, IntegrityError, OutputError, VersionError
+from player.head.head import Head
 
 SMALLEST = Manifest(
     generator="t",
@@ -125,6 +127,29 @@ def test_missing_cut_and_changed_files_are_named(name: str, broken_folder: Path)
     path.unlink()
     with pytest.raises(FormatError, match=rf"{name}: no such file: expected a file of {len(data)} bytes"):
         Asset.open(broken_folder)
+
+
+@pytest.mark.parametrize("name", ["head.onnx", "cameras.json"])
+def test_a_file_of_another_bake_is_not_read(name: str, broken_folder: Path) -> None:
+    """As an interrupted copy over an older asset leaves it, or a bake into the folder of an open one: another
+    file of the same size."""
+    before = Asset.open(broken_folder)
+    data = (broken_folder / name).read_bytes()
+    (broken_folder / name).write_bytes(data[:-1] + bytes([data[-1] ^ 1]))
+    reads = {"head.onnx": Head.of, "cameras.json": asset_cameras}
+    for asset in (before, Asset.open(broken_folder)):
+        with pytest.raises(IntegrityError, match=rf"{name}: sha256: expected [0-9a-f]{{16}}\.\.\., got"):
+            reads[name](asset)
+
+
+def test_an_asset_is_read_after_the_current_folder_has_changed(
+    broken_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(broken_folder.parent)
+    asset = Asset.open(broken_folder.name)
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    assert len(asset_cameras(asset)) == 5 and asset.path("mesh.ply").read_bytes() == b"ply\n"
 
 
 def replace_file(folder: Path, name: str, data: bytes) -> None:

@@ -119,7 +119,8 @@ asset = Asset.open(folder)
 render(asset, read_cameras(folder / "cameras.json")[0], march="numba")
 march_compiled.march(contracted_grid(bumps, lambda x: x[:, 0] < 4), *some_rays(20), 3)
 (out / "head.onnx").write_bytes(head_onnx(random_head(8), [(-1.0, 1.0)] * 4))
-Head(out / "head.onnx", 8, compiled=True)(np.zeros((9, 8), np.float32), np.ones((9, 3), np.float32))
+head = Head((out / "head.onnx").read_bytes(), 8, compiled=True)
+head(np.zeros((9, 8), np.float32), np.ones((9, 3), np.float32))
 for module in (head_compiled, march_compiled, pixels_compiled):
     for name, function in vars(module).items():
         if hasattr(function, "inspect_llvm"):

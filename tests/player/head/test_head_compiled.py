@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -39,10 +38,8 @@ def in_8_bits(weights: HeadWeights, n_channels: int = 8) -> bytes:
     return head_onnx(weights, activation_ranges(weights, *inputs(2000, n_channels)))
 
 
-def open_head(folder: Path, data: bytes, n_channels: int = 8) -> Head:
-    path = folder / "head.onnx"
-    path.write_bytes(data)
-    head = Head(path, n_channels, compiled=True)
+def open_head(data: bytes, n_channels: int = 8) -> Head:
+    head = Head(data, n_channels, compiled=True)
     assert isinstance(head._run, CompiledHead)
     return head
 
@@ -57,11 +54,9 @@ def check(rgb: np.ndarray, expected: np.ndarray) -> None:
         assert np.sqrt((difference**2).mean()) < 2e-4 and (difference < TOLERANCE).mean() > 0.9
 
 
-def test_a_head_in_float32_is_onnxruntimes(tmp_path: Path) -> None:
+def test_a_head_in_float32_is_onnxruntimes() -> None:
     """onnxruntime runs heads in float32, which it does faster, even if compiled code was asked for."""
-    path = tmp_path / "head.onnx"
-    path.write_bytes(head_onnx(random_head()))
-    heads = [Head(path, 8, compiled) for compiled in (False, True)]
+    heads = [Head(head_onnx(random_head()), 8, compiled) for compiled in (False, True)]
     assert not any(isinstance(head._run, CompiledHead) for head in heads)
     assert heads[0](*inputs(100)).tobytes() == heads[1](*inputs(100)).tobytes()
 
@@ -78,25 +73,25 @@ def test_a_head_in_float32_is_onnxruntimes(tmp_path: Path) -> None:
     ],
     ids=["32", "64", "17", "40", "64 hard swish", "18 hard swish"],
 )
-def test_compiled_head_is_the_formula_in_any_number_of_pixels(weights: HeadWeights, tmp_path: Path) -> None:
+def test_compiled_head_is_the_formula_in_any_number_of_pixels(weights: HeadWeights) -> None:
     data = in_8_bits(weights, weights.n_channels)
-    head, arrays = open_head(tmp_path, data, weights.n_channels), read_head(data, "head")
+    head, arrays = open_head(data, weights.n_channels), read_head(data, "head")
     for n in (0, 1, BLOCK - 1, BLOCK + 1, CHUNK + 5):
         features, dirs = inputs(n, weights.n_channels)
         check(head(features, dirs), play_in_integers(arrays, features, dirs))
 
 
-def test_heads_whose_encoded_features_are_not_rounded(tmp_path: Path) -> None:
+def test_heads_whose_encoded_features_are_not_rounded() -> None:
     """Heads of the first version, which do not round encoded features, give the right colours."""
     weights, (features, dirs) = random_head(), inputs(2000)
     data = head_onnx_with_floats(weights, activation_ranges(weights, features, dirs))
     expected = play_in_integers(read_head(data, "head"), features, dirs)
-    check(open_head(tmp_path, data)(features, dirs), expected)
-    check(Head(tmp_path / "head.onnx", 8)(features, dirs), expected)
+    check(open_head(data)(features, dirs), expected)
+    check(Head(data, 8)(features, dirs), expected)
 
 
-def test_a_pixel_does_not_depend_on_the_others(tmp_path: Path) -> None:
-    head = open_head(tmp_path, in_8_bits(random_head()))
+def test_a_pixel_does_not_depend_on_the_others() -> None:
+    head = open_head(in_8_bits(random_head()))
     features, dirs = inputs(200)
     whole = head(features, dirs)
     parts = [head(features[i : i + 7], dirs[i : i + 7]) for i in range(0, 200, 7)]
@@ -104,42 +99,41 @@ def test_a_pixel_does_not_depend_on_the_others(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("size", [1e-30, 30.0])
-def test_compiled_head_of_hard_features(size: float, tmp_path: Path) -> None:
+def test_compiled_head_of_hard_features(size: float) -> None:
     """The compiled head is right for tiny features, and for features beyond the range of erf."""
     data = in_8_bits(random_head())
     features, dirs = inputs(100)
     features *= np.float32(size)
-    check(
-        open_head(tmp_path, data)(features, dirs), play_in_integers(read_head(data, "head"), features, dirs)
-    )
+    check(open_head(data)(features, dirs), play_in_integers(read_head(data, "head"), features, dirs))
 
 
-def test_compiled_head_beyond_the_range_of_exp(tmp_path: Path) -> None:
+def test_compiled_head_beyond_the_range_of_exp() -> None:
     weights = random_head()
     weights = replace(weights, output=(weights.output[0] * np.float32(1e6), weights.output[1]))
-    rgb = open_head(tmp_path, in_8_bits(weights))(*inputs(100))
+    rgb = open_head(in_8_bits(weights))(*inputs(100))
     assert np.isin(rgb.round(6), [0, 1]).mean() > 0.9 and rgb.min() >= 0 and rgb.max() <= 1
 
 
-def test_what_is_no_number_is_told(tmp_path: Path) -> None:
+def test_what_is_no_number_is_told() -> None:
     """NaN colours are refused. They arise where float32 does not hold a sum after the last rounding; before a
     rounding, NaN becomes a level."""
     weights = random_head(n_more=0)
     bottleneck, *others = weights.directional_first
     weights = replace(weights, directional_first=(np.full_like(bottleneck, 3e38), *others))
-    head = open_head(tmp_path, head_onnx(weights, [(-1.0, 3.0)] * 2))
+    head = open_head(head_onnx(weights, [(-1.0, 3.0)] * 2))
     with pytest.raises(FormatError, match="expected 100 finite colours, got NaN"):
         head(*inputs(100))
 
 
 @pytest.mark.parametrize("width", [64, 40, 300])
-def test_compiled_head_in_8_bits_is_onnxruntimes(width: int, tmp_path: Path) -> None:
+def test_compiled_head_in_8_bits_is_onnxruntimes(width: int) -> None:
     """The compiled 8-bit head agrees with onnxruntime, also with more than 256 inputs to a layer, which is
     wider than a row of bytes."""
-    head = open_head(tmp_path, in_8_bits(random_head(width=width)))
+    data = in_8_bits(random_head(width=width))
+    head = open_head(data)
     for n in (0, 1, BLOCK - 1, 2000):
         features, dirs = (column[:n] for column in inputs(2000))
-        check(head(features, dirs), Head(tmp_path / "head.onnx", 8)(features, dirs))
+        check(head(features, dirs), Head(data, 8)(features, dirs))
 
 
 @pytest.mark.parametrize("width", [64, 40])
@@ -160,7 +154,7 @@ def test_codes_in_bytes_and_in_floats_are_the_same_picture(width: int) -> None:
     SUMS.holds([picture.tobytes() == pictures[0].tobytes() for picture in pictures])
 
 
-def test_products_of_bytes_are_exact(tmp_path: Path) -> None:
+def test_products_of_bytes_are_exact() -> None:
     """Products of bytes are exact, though 255 * 127 four times over does not fit into 16 bits, in which some
     processors add pairs of products. Such weights are no longer written, but still played right."""
     weights = random_head(n_channels=8, width=64, n_more=1, sh_degree=4)
@@ -170,7 +164,7 @@ def test_products_of_bytes_are_exact(tmp_path: Path) -> None:
     ranges = [(0.0, 1e-3)] * 3  # every activation is clipped at code 255, or is 0
     data = head_onnx_of_before(weights, ranges)
     assert read_head(data, "head").may_saturate
-    rgb = open_head(tmp_path, data, 8)(features * 50, dirs)
+    rgb = open_head(data, 8)(features * 50, dirs)
     expected = play_in_integers(read_head(data, "head"), features * 50, dirs)
     CLIPPED_SUMS.check(rgb, expected)
 
@@ -194,15 +188,13 @@ def test_encoded_features_keep_neighbours_whose_products_fit_into_16_bits() -> N
 
 
 @pytest.mark.parametrize("sh_degree", [1, 2, 5, 8])
-def test_any_number_of_bands(sh_degree: int, tmp_path: Path) -> None:
+def test_any_number_of_bands(sh_degree: int) -> None:
     data = in_8_bits(random_head(sh_degree=sh_degree))
     features, dirs = inputs(100)
-    check(
-        open_head(tmp_path, data)(features, dirs), play_in_integers(read_head(data, "head"), features, dirs)
-    )
+    check(open_head(data)(features, dirs), play_in_integers(read_head(data, "head"), features, dirs))
 
 
-def test_canaries_of_a_head_die_where_a_size_is_wrong(tmp_path: Path) -> None:
+def test_canaries_of_a_head_die_where_a_size_is_wrong() -> None:
     """A program that allots less memory than its values need is stopped by the canaries."""
     assert CANARIES, "tests are to run with VFR_CANARIES=1"
     program = program_of(read_head(in_8_bits(random_head()), "head"))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import onnx
@@ -39,13 +38,11 @@ PLAIN, IN_8_BITS = head_onnx(WEIGHTS), head_onnx(WEIGHTS, RANGES)
 Change = Callable[[onnx.ModelProto], object]
 
 
-def refused(data: bytes, folder: Path, message: str) -> None:
+def refused(data: bytes, message: str) -> None:
     """Check that a head is refused in both ways to run it, in one line that names the file once."""
-    path = folder / "head.onnx"
-    path.write_bytes(data)
     for compiled in (False, True):
         with pytest.raises(FormatError, match=message) as caught:
-            Head(path, N_CHANNELS, compiled)
+            Head(data, N_CHANNELS, compiled)
         text = str(caught.value)
         assert "\n" not in text and len(text) < 400 and text.count("head.onnx") == 1
 
@@ -150,10 +147,10 @@ def to_nan(array: np.ndarray) -> np.ndarray:
         (lambda model: setattr(node_of(model, "sh_monomials").attribute[0], "i", 0), "nodes: expected the"),
     ],
 )  # fmt: skip
-def test_heads_that_are_not_ours(change: Change, message: str, tmp_path: Path) -> None:
+def test_heads_that_are_not_ours(change: Change, message: str) -> None:
     model = onnx.load_from_string(PLAIN)
     change(model)
-    refused(model.SerializeToString(), tmp_path, message)
+    refused(model.SerializeToString(), message)
 
 
 @pytest.mark.parametrize(
@@ -175,10 +172,10 @@ def test_heads_that_are_not_ours(change: Change, message: str, tmp_path: Path) -
         (lambda model: setattr(node_of(model, "to_sh_weight").attribute[0], "i", 0), "nodes: expected the"),
     ],
 )
-def test_heads_in_8_bits_that_are_not_ours(change: Change, message: str, tmp_path: Path) -> None:
+def test_heads_in_8_bits_that_are_not_ours(change: Change, message: str) -> None:
     model = onnx.load_from_string(IN_8_BITS)
     change(model)
-    refused(model.SerializeToString(), tmp_path, message)
+    refused(model.SerializeToString(), message)
     if "sums of products" in message:
         TOO_LARGE_SUMS.holds()
 
@@ -230,12 +227,10 @@ def rewritten(data: bytes, path: tuple[int, ...], change: Callable[[bytes], byte
         ((), b"\x3b", "got graph of wire type 3"),
     ],
 )
-def test_messages_that_can_be_read_in_two_ways(
-    path: tuple[int, ...], more: bytes, message: str, tmp_path: Path
-) -> None:
+def test_messages_that_can_be_read_in_two_ways(path: tuple[int, ...], more: bytes, message: str) -> None:
     """Ambiguous messages are refused. onnxruntime loads some of them: of two values it takes the last one."""
     assert rewritten(PLAIN, path, lambda content: content) == PLAIN
-    refused(rewritten(PLAIN, path, lambda content: content + more), tmp_path, message)
+    refused(rewritten(PLAIN, path, lambda content: content + more), message)
 
 
 @pytest.mark.parametrize(
@@ -249,8 +244,8 @@ def test_messages_that_can_be_read_in_two_ways(
     ],
     ids=["empty", "script", "noise", "cut", "9 channels"],
 )
-def test_files_that_are_no_head(data: bytes, message: str, tmp_path: Path) -> None:
-    refused(data, tmp_path, message)
+def test_files_that_are_no_head(data: bytes, message: str) -> None:
+    refused(data, message)
 
 
 def test_a_head_that_no_player_takes_is_not_written() -> None:
@@ -291,10 +286,8 @@ def test_every_pair_of_codes_is_bounded_and_one_reaches_the_bound() -> None:
 
 @pytest.mark.parametrize(("data", "entry"), [(head_onnx_of_before, "1"), (head_onnx, "")])
 def test_onnxruntime_is_asked_for_exact_products_of_older_heads(
-    data: Callable[..., bytes], entry: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    data: Callable[..., bytes], entry: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    path = tmp_path / "head.onnx"
-    path.write_bytes(data(WEIGHTS, RANGES))
     asked: list[onnxruntime.SessionOptions] = []
     start = onnxruntime.InferenceSession
 
@@ -303,7 +296,7 @@ def test_onnxruntime_is_asked_for_exact_products_of_older_heads(
         return start(data, options, **more)
 
     monkeypatch.setattr(onnxruntime, "InferenceSession", session)
-    Head(path, N_CHANNELS)
+    Head(data(WEIGHTS, RANGES), N_CHANNELS)
     if entry:
         assert asked[0].get_session_config_entry("session.x64quantprecision") == entry
     else:

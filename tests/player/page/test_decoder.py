@@ -17,7 +17,7 @@ from player.asset.asset import Asset, GridArrays, write_asset
 from player.asset.pyramid import Bricks, Pyramid, PyramidValues
 from player.cameras.views import asset_cameras
 from player.errors import ConfigError
-from player.head.head import read_head_file
+from player.head.head import asset_head
 from player.page import page
 from player.page.scene_files import scene_files
 from tests.player.asset.test_parts import MANIFEST, STEPS, cells, stored
@@ -129,7 +129,7 @@ def test_it_decodes_where_workers_or_checksums_are_not_to_be_had(
 
 
 def test_the_head_is_what_the_player_reads(chromium: Browser, tmp_path: Path, levels: Asset) -> None:
-    _, arrays = read_head_file(levels.path("head.onnx"), 9)
+    arrays = asset_head(levels)
     head = check(chromium, tmp_path, levels)["head"]
     assert head["n_channels"] == 9 and head["sh_degree"] == arrays.form.sh_degree
     for name in ("to_sh", "harmonics", "bottleneck", "output"):

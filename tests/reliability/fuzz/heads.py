@@ -334,7 +334,7 @@ def head_targets(work: Path, small: bytes) -> list[Target]:
     }
 
     def read(compiled: bool) -> None:
-        head = Head(path, N_CHANNELS, compiled)
+        head = Head(path.read_bytes(), N_CHANNELS, compiled)
         check_colours(head(features.astype(np.float32), dirs.astype(np.float32)), len(dirs))
 
     def prepare(whole: bytes, random: np.random.Generator) -> None:

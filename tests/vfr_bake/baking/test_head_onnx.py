@@ -7,7 +7,6 @@ quantisation of the same layers.
 from __future__ import annotations
 
 import dataclasses
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +21,7 @@ from exporters.head.onnx_head import HeadWeights, Range, head_onnx, weight_scale
 from exporters.head.ranges import activation_ranges
 from player.asset.asset import Asset
 from tests.exporters.formats import block
+from tests.exporters.head.test_asset_head import with_head
 from tests.numerics.bounds import Row
 from vfr_bake.baking.head import fold_head
 from vfr_bake.config import FieldConfig
@@ -68,10 +68,7 @@ def asset(weights: HeadWeights, tmp_path_factory: pytest.TempPathFactory) -> Ass
 
 
 def exported(asset: Asset, folder: Path, data: bytes, decode: bool) -> onnxruntime.InferenceSession:
-    copy = dataclasses.replace(asset, folder=folder / "asset")
-    shutil.copytree(asset.folder, copy.folder)
-    (copy.folder / "head.onnx").write_bytes(data)
-    written = head_bytes(copy, decode)
+    written = head_bytes(with_head(asset, folder / "asset", data), decode)
     onnx.checker.check_model(onnx.load_from_string(written), full_check=True)
     return onnxruntime.InferenceSession(written, providers=["CPUExecutionProvider"])
 
