@@ -12,8 +12,9 @@ Files of `player/page/web`:
 - `*.glsl` are shaders. They are joined to the module `shaders.js`, which is written here: `import { shaders }
   from "./shaders.js";`, then `shaders["march.glsl"]`.
 - `style.css` is the style.
-- `index.html` is the page. `{{title}}` in it is replaced by text, `{{poster}}` by an address for `src`, and
-  `{{policy}}`, `{{style}}`, `{{data}}` and `{{script}}` by whole elements.
+- `index.html` is the page. In it, `{{title}}` and `{{advice}}`, which says what to do where no script runs,
+  are replaced by text, `{{poster}}` by an address for `src`, and `{{policy}}`, `{{style}}`, `{{data}}` and
+  `{{script}}` by whole elements.
 
 In the one file, each file of the data is an element `<script type="text/plain" data-file="NAME">`, the
 manifest as it is and the others as text. The compressed script is the element with the id `viewer`. `boot.js`
@@ -46,6 +47,14 @@ INDEX = "index.html"
 STYLE = "style.css"
 BOOT = "boot.js"
 POSTER = "poster.jpg"
+_ADVICE_OF_ONE_FILE = (
+    "Open the page in a current Chrome, Edge, Firefox or Safari with JavaScript switched on."
+)
+_ADVICE_OF_MANY_FILES = (
+    "Open this folder through a web server: type python -m http.server in it, then open "
+    "http://localhost:8000/. Or export the scene as one file, whose name ends in .html. On a server, the "
+    "folder's address must end in a slash, and files that end in .js must be sent as text/javascript."
+)
 MAX_GPU_MB = 512
 """Megabytes of graphics memory that a page may take, unless more are allowed."""
 _POLICY = (
@@ -118,6 +127,7 @@ def page_of_one_file(
         "title": _title(asset, title),
         "style": f"<style>{style}</style>",
         "poster": f"data:image/jpeg;base64,{poster}",
+        "advice": _ADVICE_OF_ONE_FILE,
         "script": f'<script type="text/plain" id="viewer" data-bytes="{len(packed)}">{viewer}</script>\n'
         f'<script type="module">{boot}</script>',
     }
@@ -142,6 +152,7 @@ def page_of_many_files(asset: Asset, title: str | None = None, max_gpu_mb: int =
         "title": _title(asset, title),
         "style": f'<link rel="stylesheet" href="{STYLE}">',
         "poster": POSTER,
+        "advice": _ADVICE_OF_MANY_FILES,
         "script": '<script type="module" id="script" src="main.js"></script>',
         "data": "",
     }

@@ -18,6 +18,7 @@ async function unpacked(element) {
 }
 
 async function begin() {
+  document.getElementById("status").textContent = ""; // what stands there where no script runs
   const script = document.createElement("script");
   script.id = "script";
   script.textContent = await unpacked(document.getElementById("viewer"));

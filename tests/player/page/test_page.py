@@ -28,6 +28,7 @@ from player.page.scene_files import scene_files
 from player.page.text_bytes import ALPHABET, bytes_of_text, text_of_bytes
 from tests.player.conftest import look_at
 from tests.player.page import scenes
+from tests.player.page.viewer_page import wait_for
 
 SECONDS = 120
 MOST_VIEWER = 60_000
@@ -53,20 +54,19 @@ def opened(
     found.page.on("console", lambda message: found.said.append(message.text))
     found.page.on("pageerror", lambda error: found.said.append(str(error)))
     found.page.on("request", lambda request: found.asked.append(request.url))
-
-    def answer(route: Route) -> None:
-        assert answers is not None
-        known = answers.get(route.request.url)
-        if known is None:
-            route.abort()
-        else:
-            route.fulfill(body=known[0], content_type=known[1])
-
     if answers is not None:
-        context.route("**/*", answer)
+        context.route("**/*", lambda route: answer(route, answers))
     found.page.goto(address)
     yield found
     context.close()
+
+
+def answer(route: Route, answers: dict[str, tuple[bytes, str]]) -> None:
+    known = answers.get(route.request.url)
+    if known is None:
+        route.abort()
+    else:
+        route.fulfill(body=known[0], content_type=known[1])
 
 
 # --- bytes as text ---
@@ -261,6 +261,31 @@ def test_a_site_plays_from_a_server(chromium: Browser, asset: Asset) -> None:
         check_plays(found)
         assert set(found.asked) <= set(answers)
         assert {SITE + name for name in ("poster.jpg", "worker.js", "part_0.bin")} <= set(found.asked)
+
+
+@pytest.mark.parametrize("kind", ["one file", "a folder on a disk", "a folder of plain text"])
+def test_a_page_whose_script_does_not_run_says_what_to_do(
+    chromium: Browser, asset: Asset, tmp_path: Path, kind: str
+) -> None:
+    files = {"index.html": page(asset)} if kind == "one file" else page_of_many_files(asset).files
+    for name, data in files.items():
+        (tmp_path / name).write_bytes(data)
+    with chromium.new_context(java_script_enabled=kind != "one file") as context:
+        found = context.new_page()
+        found.set_default_timeout(SECONDS * 1000)
+        if kind == "a folder of plain text":
+            plain = {
+                url: (data, type_.replace("/javascript", "/plain"))
+                for url, (data, type_) in site(asset).items()
+            }
+            context.route("**/*", lambda route: answer(route, plain))
+            found.goto(SITE)
+        else:
+            found.goto((tmp_path / "index.html").as_uri())
+        wait_for(found, lambda: found.locator("#status span").evaluate("e => e.offsetHeight") > 10)
+        said = found.inner_text("#status")
+    assert said.startswith("Loading… If this text stays, the page's script cannot run here. Open ")
+    assert ("python -m http.server" in said) == (kind != "one file") == ("scene as one file" in said)
 
 
 def check_advises_another_device(found: Opened) -> str:

@@ -73,6 +73,7 @@ def page_files(loader: str, poster: bytes = b"") -> dict[str, bytes]:
     html = files["index.html"]
     parts = {
         "policy": "",
+        "advice": "",
         "title": "Lego",
         "style": '<link rel="stylesheet" href="style.css">',
         "poster": "poster.jpg"
