@@ -18,6 +18,8 @@ HEAD_CHUNK = 8192
 """Pixels per evaluation of the head: large enough to amortise the call, small enough to stay in cache."""
 SMALL = 24
 """Pixels along each side of the small pictures from which the mean colour is computed."""
+PIXELS_AT_ONCE = 2**20
+"""Pixels of a picture whose rays and features are held at once, in some 160 MB."""
 RAY_CHUNK = 1024
 """Rays whose samples are held at once where colours are composited, with a head at each sample."""
 
@@ -40,9 +42,20 @@ def head_colours(field: VfrField, features: np.ndarray, dirs: np.ndarray) -> np.
 def render_image(field: VfrField, sampler: Sampler, camera: Camera, background: np.ndarray) -> np.ndarray:
     """Return the full model's picture [height, width, 3] float32 in [0, 1] for a
     camera in the model frame."""
-    colours, opacity = render_rays(field, sampler, *camera.rays())
+    colours, opacity = render_camera(field, sampler, camera)
     rgb = colours + (1 - opacity[:, None]) * background.astype(np.float32)
     return rgb.reshape(camera.height, camera.width, 3)
+
+
+def render_camera(field: VfrField, sampler: Sampler, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """Return (colours times opacity [n_pixels, 3], opacity [n_pixels]) of all pixels of a camera in the model
+    frame, in row-major order."""
+    n_pixels = camera.width * camera.height
+    colours, opacity = np.empty((n_pixels, 3), np.float32), np.empty(n_pixels, np.float32)
+    for first in range(0, n_pixels, PIXELS_AT_ONCE):
+        pixels = np.arange(first, min(first + PIXELS_AT_ONCE, n_pixels))
+        colours[pixels], opacity[pixels] = render_rays(field, sampler, *camera.rays_through(pixels))
+    return colours, opacity
 
 
 def render_rays(
