@@ -34,7 +34,7 @@ from vfr_bake.bench.worst import WorstPixel, worst_pixels
 from vfr_bake.config import BenchConfig
 from vfr_bake.data import load_scene_as
 from vfr_bake.training.scores.evaluation import RenderedView, beside_photograph
-from vfr_bake.training.scores.metrics import Distance, mean_scores, psnr, ssim
+from vfr_bake.training.scores.metrics import Distance, mean, mean_scores, psnr, ssim
 
 N_FIRST_PICTURES = 3
 """Number of times that an asset is opened to time its first picture; the median counts."""
@@ -252,7 +252,7 @@ class _Run:
         means = mean_scores([view.score(self._lpips) for view in beside])
         for name, score in (("psnr_to_model", psnr), ("ssim_to_model", ssim)):
             pairs = None if full is None else zip(_colours(pictures), _colours(full), strict=True)
-            means[name] = None if pairs is None else float(np.mean([score(a, b) for a, b in pairs]))
+            means[name] = None if pairs is None else mean([score(a, b) for a, b in pairs])
         return means
 
 

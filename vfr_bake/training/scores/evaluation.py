@@ -29,18 +29,16 @@ class RenderedView:
     """[height, width, 3] float32 in [0, 1], over the background, not rounded."""
     photograph: np.ndarray
     """[height, width, 3] float32 in [0, 1], over the same background; equal to `rgb` where it is masked."""
-    seen: float = 1.0
-    """Share of the scored pixels that are not masked."""
+    seen: np.ndarray | None = None
+    """[height, width] bool: the pixels that are not masked; None for all."""
     first_column: int = 0
     """First column that is scored; on the columns before it the exposure was fitted."""
 
     def score(self, lpips: Distance | None = None) -> ViewScore:
-        """Return the scores of the columns from `first_column` on; with `lpips`, that distance as well.
-
-        Raises ShapeError: these columns are smaller than SSIM's window.
-        """
-        rgb, photograph = self.rgb[:, self.first_column :], self.photograph[:, self.first_column :]
-        return score_view(self.name, rgb, photograph, lpips, self.seen)
+        """Return the scores of the columns from `first_column` on; with `lpips`, that distance as well."""
+        scored = np.s_[:, self.first_column :]
+        seen = None if self.seen is None else self.seen[scored]
+        return score_view(self.name, self.rgb[scored], self.photograph[scored], lpips, seen)
 
 
 def render_views(
@@ -93,11 +91,10 @@ def beside_photograph(
         gains, offsets = fitted(colours[left], opacity[left], rgba.reshape(-1, 4)[left])
         colours = (colours * gains + opacity[:, None] * offsets).clip(0, opacity[:, None])
         rgb = (colours + behind).reshape(rgb.shape)
-    photograph, seen = over_background(rgba, background), 1.0
+    photograph, seen = over_background(rgba, background), None
     if masked:
-        opaque = rgba[..., 3] == 255
-        photograph = np.where(opaque[..., None], photograph, rgb)
-        seen = float(opaque[:, first_column:].mean())
+        seen = rgba[..., 3] == 255
+        photograph = np.where(seen[..., None], photograph, rgb)
     return RenderedView(name, rgb, photograph, seen, first_column)
 
 
@@ -108,9 +105,6 @@ def evaluate(
     lpips: Distance | None = None,
     masked: bool = False,
 ) -> Iterator[ViewScore]:
-    """Yield the scores of the pictures of `render_views`; with `lpips`, that distance as well.
-
-    Raises ShapeError: a picture is smaller than SSIM's window.
-    """
+    """Yield the scores of the pictures of `render_views`; with `lpips`, that distance as well."""
     for view in render_views(model, views, n_views, masked):
         yield view.score(lpips)

@@ -113,4 +113,5 @@ def test_scores_are_of_what_is_seen() -> None:
     rgb, photograph = random.random((2, 16, 16, 3)).astype(np.float32)
     alone = score_view("a", rgb[:8].repeat(2, axis=0), photograph[:8].repeat(2, axis=0))
     half = np.concatenate([photograph[:8], rgb[8:]])
-    assert score_view("a", rgb, half, seen=0.5).psnr_float == pytest.approx(alone.psnr_float, abs=1e-4)
+    seen = np.repeat(np.arange(16)[:, None] < 8, 16, axis=1)
+    assert score_view("a", rgb, half, seen=seen).psnr_float == pytest.approx(alone.psnr_float, abs=1e-4)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
@@ -23,8 +24,9 @@ FLOAT32 = 1e-5
 that a window is off by 1e-7 / 9e-4, and the mean by less."""
 
 
-def naive_ssim(a: np.ndarray, b: np.ndarray) -> float:
-    """Evaluate equations 6 and 12 to 16 of Wang et al. 2004, one window after the other, in float64."""
+def naive_ssim(a: np.ndarray, b: np.ndarray, seen: np.ndarray | None = None) -> float:
+    """Evaluate equations 6 and 12 to 16 of Wang et al. 2004, one window after the other, in float64; only
+    windows whose middle is `seen`."""
     offsets = np.arange(11) - 5
     window = np.exp(-(offsets[:, None] ** 2 + offsets[None, :] ** 2) / (2 * 1.5**2))
     window /= window.sum()
@@ -33,6 +35,8 @@ def naive_ssim(a: np.ndarray, b: np.ndarray) -> float:
     for channel in range(3):
         for row in range(a.shape[0] - 10):
             for column in range(a.shape[1] - 10):
+                if seen is not None and not seen[row + 5, column + 5]:
+                    continue
                 x = a[row : row + 11, column : column + 11, channel].astype(np.float64)
                 y = b[row : row + 11, column : column + 11, channel].astype(np.float64)
                 mx, my = (window * x).sum(), (window * y).sum()
@@ -68,13 +72,53 @@ def test_ssim_of_constant_pictures_is_that_of_their_means(levels: tuple[float, f
 
 def test_ssim_of_a_negative_is_negative() -> None:
     a, _ = pictures((24, 24), 0, np.float64)
-    assert ssim(a, 1 - a) < -0.5
+    similarity = ssim(a, 1 - a)
+    assert similarity is not None and similarity < -0.5
 
 
-@pytest.mark.parametrize("shape", [(7, 7, 3), (10, 40, 3), (40, 10, 3), (0, 0, 3), (16, 16), (16, 16, 4)])
-def test_ssim_needs_a_whole_window_of_colours(shape: tuple[int, ...]) -> None:
-    with pytest.raises(ShapeError, match=r"ssim: expected \[height, width, 3\] of at least 11 x 11 pixels"):
+@pytest.mark.parametrize("shape", [(16, 16), (16, 16, 4)])
+def test_ssim_needs_colours(shape: tuple[int, ...]) -> None:
+    with pytest.raises(ShapeError, match=r"ssim: expected \[height, width, 3\], got"):
         ssim(np.zeros(shape), np.zeros(shape))
+
+
+@pytest.mark.parametrize("shape", [(7, 7), (10, 40), (40, 10), (0, 0)])
+def test_pictures_smaller_than_a_window_have_no_ssim(shape: tuple[int, int]) -> None:
+    assert ssim(np.zeros((*shape, 3)), np.zeros((*shape, 3))) is None
+
+
+def test_a_tiny_view_has_a_psnr_and_no_ssim() -> None:
+    a, b = pictures((8, 9), 0.1, np.float32)
+    score = score_view("a", a, b)
+    assert 10 < score.psnr_float < 30 and score.ssim is None and score.ssim_float is None
+    assert mean_scores([score, replace(score, ssim=0.5)])["ssim"] is None
+
+
+def test_masked_pixels_count_in_no_score() -> None:
+    """Half of the view is masked and equal to the render there. Its scores are those of the other half; LPIPS
+    cannot leave pixels out."""
+    a, b = pictures((24, 30), 0.1, np.float32)
+    seen = np.repeat(np.arange(30)[None] < 15, 24, axis=0)
+    b[~seen] = a[~seen]
+    score = score_view("a", a, b, lambda *_: 0.5, seen)
+    assert score.psnr_float == pytest.approx(psnr(a[:, :15], b[:, :15]), abs=1e-9)
+    assert score.ssim_float == pytest.approx(naive_ssim(a, b, seen), abs=FLOAT32)
+    whole = ssim(a, b)
+    assert score.ssim_float is not None and whole is not None and score.ssim_float < whole - 0.005
+    assert score.lpips is None
+    assert score_view("a", a, b, lambda *_: 0.5, np.ones_like(seen)).lpips == 0.5, "nothing is masked"
+    border = np.zeros_like(seen)
+    border[:4] = True  # no window lies around these pixels
+    assert score_view("a", a, b, seen=border).ssim is None
+
+
+def test_large_pictures_are_compared_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
+    a, b = pictures((41, 17), 0.1, np.float32)
+    seen = np.random.default_rng(1).random((41, 17)) < 0.5
+    whole = score_view("a", a, b), score_view("a", a, b, seen=seen)
+    monkeypatch.setattr("vfr_bake.training.scores.metrics.VALUES_AT_ONCE", 3 * 17 * 7)
+    for first, again in zip(whole, (score_view("a", a, b), score_view("a", a, b, seen=seen)), strict=True):
+        assert asdict(again) == pytest.approx(asdict(first), abs=1e-9)
 
 
 @pytest.mark.parametrize("measure", [psnr, ssim, comparison])
@@ -97,6 +141,7 @@ def test_scores_before_and_after_rounding() -> None:
     across = score_view("a", grey, grey + 0.6 / 255)
     assert across.psnr == pytest.approx(20 * np.log10(255))
     assert across.psnr_float == pytest.approx(20 * np.log10(255 / 0.6))
+    assert across.ssim is not None and across.ssim_float is not None
     assert across.ssim < across.ssim_float < 1 + FLOAT32
 
 
