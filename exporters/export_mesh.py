@@ -92,7 +92,7 @@ def export_mesh(
     if n_faces is not None:
         finest = _simplified(finest, n_faces, report)
         facts["faces_asked"] = n_faces
-    if name != "obj":  # the format that has more digits than float32
+    if name != "obj":  # its decimals follow the mesh's extent
         check_steps(finest.transformed(matrix), str(target), NEARER)
     is_white = "method" in facts and options.texture is None and name != "stl"
     written: dict[Path, bytes] = {}

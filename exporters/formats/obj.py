@@ -24,8 +24,8 @@ _CHUNK = 1 << 17  # rows turned into text at once, with tens of megabytes of scr
 
 
 def obj_bytes(mesh: TriangleMesh) -> bytes:
-    """Return the file's content: positions to nine digits of the largest one, colours
-    to 1e-4 (8 bits survive).
+    """Return the file's content: positions to nine digits of the mesh's extent (`n_decimals`), colours to
+    1e-4 (8 bits survive).
 
     Raises ConfigError for a coordinate of 1e15 or more.
 
@@ -35,7 +35,7 @@ def obj_bytes(mesh: TriangleMesh) -> bytes:
     >>> print(obj_bytes(mesh).decode().splitlines()[-1])
     f 1//1 2//2 3//3
     """
-    vertices = _rows("v", (mesh.vertices, _decimals(mesh)), (mesh.colours[:, :3] / 255, 4))
+    vertices = _rows("v", (mesh.vertices, n_decimals(mesh)), (mesh.colours[:, :3] / 255, 4))
     return b"".join([_PLAIN, *vertices, *_rows("vn", (mesh.normals, 6)), *_faces(mesh.faces, "//", 2)])
 
 
@@ -60,7 +60,7 @@ def textured_obj_files(mesh: TriangleMesh, texture: Texture, stem: str) -> dict[
         [
             _TEXTURED,
             f"mtllib {stem}.mtl\nusemtl surface\n".encode(),
-            *_rows("v", (mesh.vertices, _decimals(mesh))),
+            *_rows("v", (mesh.vertices, n_decimals(mesh))),
             *_rows("vt", (flipped, 7)),
             *_rows("vn", (mesh.normals, 6)),
             *_faces(mesh.faces, "/", 3),
@@ -77,6 +77,32 @@ def check_stem(stem: str) -> None:
         raise ConfigError(
             f"OBJ: name: expected one without spaces, which MTL files cannot name, got {stem!r}"
         )
+
+
+def n_decimals(mesh: TriangleMesh) -> int:
+    """Return the number of decimals of positions: nine digits of the mesh's extent, or of its largest
+    coordinate if that is smaller, so that a small mesh far from the origin keeps its shape. Digits that
+    float64 does not have are left out.
+
+    Raises ConfigError for a coordinate of 1e15 or more.
+
+    >>> corners = np.array([[0.0, 0, 0], [0.25, 0, 0], [0, 0.5, 0]]) + 4.5e6
+    >>> up, white = np.tile([0.0, 0.0, 1.0], (3, 1)), np.full((3, 4), 255, np.uint8)
+    >>> n_decimals(TriangleMesh(corners, np.array([[0, 1, 2]], np.int32), up, white))
+    9
+    """
+    largest = float(np.abs(mesh.vertices).max(initial=0.0))
+    if largest >= 1e15:
+        raise ConfigError(f"OBJ: vertices: expected coordinates below 1e15, got {largest:g}")
+    if not largest:
+        return 1
+    extent = float(np.ptp(mesh.vertices, axis=0).max()) or largest
+    wanted, there = 8 - _exponent(min(extent, largest)), 15 - _exponent(largest)
+    return min(max(min(wanted, there), 0), 15)
+
+
+def _exponent(value: float) -> int:
+    return math.floor(math.log10(value))
 
 
 def parse_obj(data: bytes, where: str) -> dict[str, np.ndarray]:
@@ -105,13 +131,6 @@ def parse_obj(data: bytes, where: str) -> dict[str, np.ndarray]:
     if textured:
         return {**found, "uvs": rows["vt"] * [1, -1] + [0, 1]}
     return {**found, "colours": rows["v"][:, 3:]}
-
-
-def _decimals(mesh: TriangleMesh) -> int:
-    largest = float(np.abs(mesh.vertices).max(initial=0.0))
-    if largest >= 1e15:
-        raise ConfigError(f"OBJ: vertices: expected coordinates below 1e15, got {largest:g}")
-    return min(max(8 - math.floor(math.log10(largest)), 0), 15) if largest else 1
 
 
 def _rows(word: str, *columns: tuple[np.ndarray, int]) -> list[bytes]:

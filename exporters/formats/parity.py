@@ -10,7 +10,7 @@ import numpy as np
 
 from exporters.formats.glb import glb_content, y_up
 from exporters.formats.npz import parse_npz
-from exporters.formats.obj import parse_obj
+from exporters.formats.obj import n_decimals, parse_obj
 from exporters.formats.ply import parse_ply
 from exporters.formats.points import parse_points
 from exporters.formats.stl import parse_stl
@@ -64,7 +64,7 @@ def check_mesh_bytes(
 
     Compared are counts, places, normals and faces, and the colours or else the places in the picture; for a
     GLB also every texel. An STL has no vertices, so only the corners of its faces are compared. Places may
-    differ by what the format rounds: float32 for PLY, GLB, STL and USD, nine digits for OBJ. The message
+    differ by what the format rounds: float32 for PLY, GLB, STL and USD, the last decimal for OBJ. The message
     names the largest difference.
     """
     if suffix == ".stl":
@@ -74,7 +74,8 @@ def check_mesh_bytes(
     found = _content(suffix, data, where)
     is_glb = suffix == ".glb"
     vertices, normals = (y_up(a) if is_glb else a for a in (mesh.vertices, mesh.normals))
-    _check_rows(where, "vertices", vertices, found["vertices"], _rounding(mesh))
+    tolerance = _last_decimal(mesh) if suffix == ".obj" else _rounding(mesh)
+    _check_rows(where, "vertices", vertices, found["vertices"], tolerance)
     _check_rows(where, "normals", normals, found["normals"], 1e-6)
     _check_rows(where, "faces", mesh.faces, found["faces"], 0.0)
     if texture is None:
@@ -149,8 +150,13 @@ def _sorted(index: np.ndarray) -> np.ndarray:
 
 
 def _rounding(mesh: TriangleMesh) -> float:
-    """Return how far rounding to float32, or to nine digits, may move the largest coordinate."""
+    """Return how far rounding to float32 may move the largest coordinate."""
     return 2e-7 * max(float(np.abs(mesh.vertices).max(initial=0)), 1e-30)
+
+
+def _last_decimal(mesh: TriangleMesh) -> float:
+    """Return how far an OBJ may move a coordinate: by half its last decimal, and by what float64 rounds."""
+    return 0.5 * 10.0 ** -n_decimals(mesh) + 2 * float(np.spacing(np.abs(mesh.vertices).max(initial=0.0)))
 
 
 def _check_rows(where: str, what: str, expected: np.ndarray, got: np.ndarray, tolerance: float) -> None:

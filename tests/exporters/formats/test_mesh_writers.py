@@ -13,11 +13,12 @@ import pytest
 import trimesh
 
 from exporters.formats.glb import glb_bytes, parse_glb, y_up
-from exporters.formats.obj import obj_bytes
+from exporters.formats.obj import obj_bytes, parse_obj, textured_obj_files
 from exporters.formats.parity import check_mesh_bytes, check_steps
 from exporters.formats.ply import parse_ply, ply_bytes, read_ply, small_ply_bytes, small_ply_size
 from exporters.shapes.colour import linear_from_srgb
 from exporters.shapes.mesh import TriangleMesh
+from exporters.shapes.texture import Texture
 from player.errors import ConfigError, FormatError, IntegrityError, ParityError
 from tests.exporters.meshes import random_mesh, sphere, tetrahedron
 
@@ -239,6 +240,25 @@ def test_too_far_from_the_origin_for_float32() -> None:
     with pytest.raises(ConfigError, match=message):
         check_steps(far, "a.ply", "come nearer")
     check_steps(replace(far, faces=far.faces[:0]), "a.ply", "come nearer")
+
+
+@pytest.mark.parametrize("textured", [False, True])
+def test_an_obj_far_from_the_origin_keeps_its_shape(textured: bool) -> None:
+    """In the coordinates of a map, places of a small thing are as exact as float64 has them there: its steps
+    at 4.5e6 are 2^-30."""
+    near = sphere(20, 0.15)
+    mesh = replace(near, vertices=near.vertices + np.array([4.5e6, -5e5, 300.0]))
+    if textured:
+        texture = Texture(np.zeros((len(mesh.vertices), 2), np.float32), np.zeros((2, 2, 3), np.uint8))
+        data = textured_obj_files(mesh, texture, "far")[".obj"]
+    else:
+        data = obj_bytes(mesh)
+        check_mesh_bytes(".obj", data, mesh, "far.obj")
+        moved = replace(mesh, vertices=mesh.vertices + 1e-8)
+        with pytest.raises(ParityError, match="vertices: number"):
+            check_mesh_bytes(".obj", data, moved, "far.obj")
+    read = parse_obj(data, "far.obj")["vertices"]
+    assert np.abs(read - mesh.vertices).max() <= 0.5e-9 + 2 * 2.0**-30
 
 
 @pytest.mark.parametrize("suffix", WRITERS)
