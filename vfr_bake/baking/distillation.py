@@ -28,7 +28,7 @@ from player.march.path import path_of
 from player.progress import Progress
 from vfr_bake.baking.grids import Layout, unit_points
 from vfr_bake.kernels.stored_features import compose, composite, corner_rows, interpolate, padded, take_runs
-from vfr_bake.rendering.render import head_colours
+from vfr_bake.rendering.render import render_rays
 from vfr_bake.training.model_file import Model
 
 RAYS_AT_ONCE = 1 << 12
@@ -241,14 +241,23 @@ def photographed_rays(model: Model, most: int, progress: Progress) -> TeacherRay
     A photograph contains detail that the model has not learned, but also errors that no other photograph has:
     noise, or a camera that is a little wrong. The model has different errors, so the mean of both is nearer
     to what other views show than either alone (docs/notes/2026-11-26-photographs-in-refinement.md).
+
+    Opaque photographs of an object show its background, too, and do not tell where the object ends. There
+    the opacity is the model's alone, and the photograph's colour is what is left of it without the part of
+    the background that the model lets through.
     """
     rays_o, rays_d, rgba = model.training_pixel_rays()
     shown = rgba.astype(np.float32) / 255
     rays = TeacherRays(rays_o, rays_d, shown[:, :3] * shown[:, 3:], shown[:, 3].copy()).some(most)
+    is_over_background = not (model.has_alpha or model.field.config.unbounded)
     n = len(rays.opacity)
     for first in range(0, n, FIELD_RAYS_AT_ONCE):
         some = slice(first, first + FIELD_RAYS_AT_ONCE)
-        colours, opacity = _shown(model, rays.rays_o[some], rays.rays_d[some])
+        colours, opacity = render_rays(model.field, model.sampler, rays.rays_o[some], rays.rays_d[some])
+        if is_over_background:
+            behind = (1 - opacity[:, None]) * model.background
+            rays.colours[some] = (rays.colours[some] - behind).clip(0, opacity[:, None])
+            rays.opacity[some] = opacity
         rays.colours[some] += (colours - rays.colours[some]) / 2
         rays.opacity[some] += (opacity - rays.opacity[some]) / 2
         progress(min(first + FIELD_RAYS_AT_ONCE, n), n)
@@ -266,19 +275,11 @@ def render_teacher(
         n_pixels = camera.width * camera.height
         some = random.choice(n_pixels, min(n_pixels, max(n_rays // len(cameras), 1)), replace=False)
         rays_o, rays_d = camera.rays_through(some)
-        colours, opacity = _shown(model, rays_o, rays_d)
+        colours, opacity = render_rays(model.field, model.sampler, rays_o, rays_d)
         met = np.flatnonzero(opacity > 0)
         parts.append((rays_o[met], rays_d[met], colours[met], opacity[met]))
         progress(done + 1, len(cameras))
     return TeacherRays(*(np.concatenate(column) for column in zip(*parts, strict=True)))
-
-
-def _shown(model: Model, rays_o: np.ndarray, rays_d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the full model's colours times opacity [n, 3] and opacity [n], float32, on rays [n, 3]."""
-    features, opacity, _ = model.sampler.composited_features(model.field, rays_o, rays_d)
-    colours, met = np.zeros((len(opacity), 3), np.float32), np.flatnonzero(opacity > 0)
-    colours[met] = head_colours(model.field, features[met], rays_d[met]) * opacity[met, None]
-    return colours, opacity
 
 
 def collect_training_rays(

@@ -21,9 +21,10 @@ from vfr_bake.baking.distillation import TeacherRays, collect_training_rays, pho
 from vfr_bake.baking.grids import latent
 from vfr_bake.config import BakeConfig
 from vfr_bake.data.view_pixels import ViewPixels
-from vfr_bake.rendering.render import head_colours, render_image
+from vfr_bake.rendering.render import head_colours, render_image, render_rays
 from vfr_bake.training.captures.picture_colours import PictureColours
 from vfr_bake.training.model_file import Model
+from vfr_bake.training.scores.metrics import over_background
 
 ALONG, PAST = (-3.0, 0.1, 0.2), (-3.0, 5.0, 0.2)
 """Origins of rays along x: of rays that meet the box, and of rays that pass it."""
@@ -146,6 +147,28 @@ def test_photographed_rays_show_the_mean_of_photographs_and_model(model: Model) 
         photographed = shown[of_view, :3] * shown[of_view, 3:]
         np.testing.assert_allclose(rays.colours[of_view], (colours + photographed) / 2, atol=1e-4)
     assert len(photographed_rays(model, 100, silent).opacity) == 100
+
+
+def test_opaque_photographs_of_an_object_do_not_make_its_background_opaque(model: Model) -> None:
+    pixels = model.training_pixels
+    assert pixels is not None
+    over_white = over_background(pixels.rgba, np.ones(3))
+    rgba = np.full_like(pixels.rgba, 255)
+    rgba[:, :3] = (255 * over_white).round()
+    opaque = replace(model, has_alpha=False, training_pixels=replace(pixels, rgba=rgba))
+    rays = photographed_rays(opaque, 10**9, silent)
+    colours, opacity = render_rays(model.field, model.sampler, rays.rays_o, rays.rays_d)
+    np.testing.assert_array_equal(rays.opacity, opacity)
+    assert ((rays.colours >= 0) & (rays.colours <= opacity[:, None])).all()
+    empty = opacity == 0
+    assert empty.any() and (rays.colours[empty] == 0).all()
+    behind = 1 - opacity[:, None]
+    photographed = rgba[:, :3] / 255 - behind
+    possible = ((photographed >= 0) & (photographed <= opacity[:, None])).all(axis=1) & (opacity > 0.5)
+    assert possible.sum() > 1000
+    np.testing.assert_allclose(
+        (rays.colours + behind)[possible], (colours + behind + rgba[:, :3] / 255)[possible] / 2, atol=1e-5
+    )
 
 
 def test_photographs_of_another_exposure_show_what_the_field_has(model: Model) -> None:
