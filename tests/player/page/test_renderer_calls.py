@@ -352,23 +352,47 @@ def test_coarser_qualities_fetch_less_and_look_alike(page: RenderPage, asset: As
     assert errors[0] <= errors[1] < 50
 
 
-def test_qualities_keep_to_the_lookups_that_the_bake_found(page: RenderPage) -> None:
-    """The manifest's `quality_fetches` limit the lookups; 0, or a manifest without them, leaves the page's
-    own."""
-    found = page.page.evaluate(
-        """() => {
-          const { manifest } = renderer.scene, before = manifest.quality_fetches;
-          const found = [[5, 3], [0, 3], undefined].map((limits) => {
-            manifest.quality_fetches = limits;
-            return ["exact", "high", "fast"].map((quality) => renderer.quality({ quality }).uFetches);
-          });
-          manifest.quality_fetches = before;
-          return [manifest.n_fetches, found];
-        }"""
-    )
-    k, (limited, limited_fast, own) = found
-    assert limited == [k, 5, 3] and limited_fast == [k, own[1], 3]
-    assert own == [k, -(-7 * k // 8), -(-k // 2)]
+QUALITIES = """([changes, finest]) => {
+  const { scene, constant } = renderer, { manifest } = scene;
+  const cells = constant.uCellsPerUnit;
+  scene.manifest = { ...manifest, ...changes };
+  if (finest) constant.uCellsPerUnit = cells.map(() => 1 / manifest.step); // a base step is one cell long
+  const found = ["exact", "high", "fast"].map((quality) => renderer.quality({ quality }));
+  scene.manifest = manifest;
+  constant.uCellsPerUnit = cells;
+  return found.map(({ uFetches, uLongestStep }) => [uFetches, uLongestStep]);
+}"""
+"""JavaScript that returns the lookups and the longest step of each quality for a changed manifest."""
+
+
+@pytest.mark.parametrize(
+    ("n_fetches", "limits", "lookups"),
+    [
+        (12, [8, 4], [12, 8, 4]),
+        (12, [0, 8], [12, 12, 8]),
+        (12, [0, 0], [12, 12, 12]),
+        (12, [16, 13], [12, 12, 12]),
+        (0, [8, 0], [0, 8, 0]),
+        (12, None, [12, 11, 6]),
+    ],
+)
+def test_qualities_keep_to_the_lookups_that_the_bake_found(
+    page: RenderPage, n_fetches: int, limits: list[int] | None, lookups: list[int]
+) -> None:
+    """The manifest's `quality_fetches` limit the lookups, and 0 is no limit; without them, as in assets of
+    earlier versions, the page has limits of its own."""
+    changes = {"n_fetches": n_fetches} | ({} if limits is None else {"quality_fetches": limits})
+    found = page.page.evaluate(QUALITIES, [changes, False])
+    assert [lookups for lookups, _ in found] == lookups
+
+
+@pytest.mark.parametrize(("fetches", "agreement", "longer"), [(0, 0, 1), (4, 0, 2), (0, 28, 2)])
+def test_fast_pictures_are_exact_ones_if_nothing_may_be_left_out(
+    page: RenderPage, fetches: int, agreement: float, longer: int
+) -> None:
+    changes = {"quality_fetches": [0, fetches], "agreement": [0, agreement]}
+    (exact, step), _, (fast, fast_step) = page.page.evaluate(QUALITIES, [changes, True])
+    assert fast == (fetches or exact) and fast_step == longer * step
 
 
 @pytest.mark.parametrize(
