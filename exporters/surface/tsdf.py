@@ -4,6 +4,9 @@
 Marching cubes uses the density at a place; fusion uses how far the cameras see. Fog in front of a surface
 then counts for less, and thin parts that few pixels hit are lost. Pixels of less than half opacity are left
 out. So are pixels beside a jump in depth, because their mean depth lies between two surfaces.
+
+Open3D computes places in float32. The cameras are therefore moved until the mean of their places is the
+origin, which keeps the digits of a world far from its origin.
 """
 
 from __future__ import annotations
@@ -46,6 +49,7 @@ def fuse_depth(views: list[DepthView], voxel: float, progress: Progress = silent
     grid = open3d.t.geometry.VoxelBlockGrid(
         ("tsdf", "weight"), (core.float32, core.float32), (1, 1), voxel, 8, _BLOCKS, core.Device("CPU:0")
     )
+    middle = np.mean([view.camera.c2w[:3, 3] for view in views], axis=0)
     for done, view in enumerate(views, start=1):
         camera = view.camera
         depth = reliable_depth(view, JUMP * voxel)
@@ -54,7 +58,9 @@ def fuse_depth(views: list[DepthView], voxel: float, progress: Progress = silent
             lens = np.array(
                 [[camera.fx, 0, camera.cx - 0.5], [0, camera.fy, camera.cy - 0.5], [0, 0, 1]], np.float64
             )
-            pose = np.linalg.inv(camera.c2w @ OPENGL_FROM_OPENCV)
+            c2w = camera.c2w.copy()
+            c2w[:3, 3] -= middle
+            pose = np.linalg.inv(c2w @ OPENGL_FROM_OPENCV)
             picture = open3d.t.geometry.Image(tensor(depth))
             where = (tensor(lens), tensor(pose), 1.0, float(depth.max()) + voxel, TRUNCATION)
             grid.integrate(grid.compute_unique_block_coordinates(picture, *where), picture, *where)
@@ -66,7 +72,8 @@ def fuse_depth(views: list[DepthView], voxel: float, progress: Progress = silent
     vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.triangles, np.int32)
     if not len(faces):
         raise DataError("--method tsdf: expected a surface in the training cameras' views, got none")
-    return _in_order(vertices, faces)
+    places, faces, normals = _in_order(vertices, faces)
+    return Surface(places + middle, faces, normals)
 
 
 def reliable_depth(view: DepthView, jump: float) -> np.ndarray:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -28,6 +29,22 @@ def test_a_ball_again() -> None:
     assert np.linalg.norm(across[outwards], axis=-1).sum() > 0.99 * np.linalg.norm(across, axis=-1).sum()
     again = fuse_depth(all_around(1.0), 0.06)
     assert all(x.tobytes() == y.tobytes() for x, y in zip(again, (vertices, faces, normals), strict=True))
+
+
+@pytest.mark.needs("open3d")
+def test_a_ball_far_from_the_origin() -> None:
+    """In the coordinates of a map the surface is the same as near the origin, but for what float64 rounds:
+    one voxel is 0.06, and float32 would have steps of 0.5."""
+    shift = np.array([4.5e6, -5e5, 300.0])
+    moved = []
+    for view in all_around(1.0):
+        c2w = view.camera.c2w.copy()
+        c2w[:3, 3] += shift
+        moved.append(replace(view, camera=replace(view.camera, c2w=c2w)))
+    near, far = fuse_depth(all_around(1.0), 0.06), fuse_depth(moved, 0.06)
+    assert abs(len(far.faces) - len(near.faces)) < 0.01 * len(near.faces)
+    radius = np.linalg.norm(far.vertices - shift, axis=-1)
+    assert np.abs(radius - 1).mean() < 0.25 * 0.06 and np.abs(radius - 1).max() < 2 * 0.06
 
 
 def test_depth_along_the_axis_and_jumps() -> None:
