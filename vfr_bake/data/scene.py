@@ -36,6 +36,8 @@ NEAR_QUANTILE, NEAR_SHARE = 0.01, 0.5
 """If points are known, matter begins at NEAR_SHARE of the depth that one point in a hundred (NEAR_QUANTILE)
 is in front of, but at no more than 4 NEAR_CAMERA."""
 
+WHITE = (1.0, 1.0, 1.0)
+
 
 @dataclass(frozen=True)
 class Scene:
@@ -55,6 +57,9 @@ class Scene:
     """In an unbounded scene, the distance from a camera at which matter may begin, in model units."""
     masked: bool = False
     """Whether pixels that are not opaque are masked. Training does not draw them, and they are not scored."""
+    background: tuple[float, float, float] = WHITE
+    """What is behind an object, sRGB in [0, 1]: the colour of the pictures' borders if they are opaque and
+    plain, else white."""
 
 
 def build_scene(capture: Capture, kind: SceneKind = "auto") -> Scene:
@@ -73,7 +78,8 @@ def build_scene(capture: Capture, kind: SceneKind = "auto") -> Scene:
     _check_cameras(capture.name, train.cameras)
     has_alpha = not capture.masked and not all(train.opaque(number) for number in range(len(train.cameras)))
     some = _spread(train)
-    unbounded = kind == "unbounded" or (kind == "auto" and not has_alpha and not _plain_border(some))
+    plain = None if has_alpha else _plain_border(some)
+    unbounded = kind == "unbounded" or (kind == "auto" and not has_alpha and plain is None)
     if unbounded:
         centre, half = _camera_ball(train.cameras)
     else:
@@ -96,7 +102,15 @@ def build_scene(capture: Capture, kind: SceneKind = "auto") -> Scene:
     if masked:
         check_masked(capture.name, train.images)
     return Scene(
-        capture.name, moved(train), moved(test), has_alpha, world_from_model, unbounded, near, masked
+        capture.name,
+        moved(train),
+        moved(test),
+        has_alpha,
+        world_from_model,
+        unbounded,
+        near,
+        masked,
+        background=WHITE if unbounded or plain is None else plain,
     )
 
 
@@ -120,15 +134,18 @@ def _spread(views: PosedImages) -> PosedImages:
     )
 
 
-def _plain_border(views: PosedImages) -> bool:
-    """Return whether the pictures' borders show hardly anything but one colour."""
+def _plain_border(views: PosedImages) -> tuple[float, float, float] | None:
+    """Return the colour of the pictures' borders, sRGB in [0, 1]; None if they show more than one colour."""
     edges = [
         views.pixels(number, _border(camera.width, camera.height))[:, :3]
         for number, camera in enumerate(views.cameras)
     ]
     pixels = np.concatenate(edges).astype(np.int16)
-    off = np.abs(pixels - np.median(pixels, axis=0)).max(axis=1)
-    return float((off <= PLAIN_LEVELS).mean()) >= PLAIN_SHARE
+    colour = np.median(pixels, axis=0).round()
+    if (np.abs(pixels - colour).max(axis=1) <= PLAIN_LEVELS).mean() < PLAIN_SHARE:
+        return None
+    red, green, blue = (colour / 255).tolist()
+    return red, green, blue
 
 
 def _border(width: int, height: int) -> np.ndarray:

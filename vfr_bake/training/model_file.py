@@ -7,8 +7,9 @@ as transforms.json text), sampler (see below), state (the field's tensors), figu
 training).
 
 Keys that older files do not have: witnesses since version 2.1 and training_pixels since version 2.5 (both:
-`vfr_bake.training.pixel_tensors`), and exposure since version 2.2, if it differs between pictures
-(`vfr_bake.training.captures.picture_colours`).
+`vfr_bake.training.pixel_tensors`), exposure since version 2.2, if it differs between pictures
+(`vfr_bake.training.captures.picture_colours`), and object_background since version 2.6 (three numbers; white
+in older files).
 
 The sampler of an object is its occupancy grid: step (march step in model units), occupied (bits), resolution.
 The sampler of an unbounded scene is its proposals: near (model units), state (their tensors) and, since
@@ -32,6 +33,7 @@ from player.cameras.transforms import parse_transforms, transforms_cameras, writ
 from player.errors import ConfigError, FormatError, VersionError
 from player.files.json_files import brief
 from vfr_bake.config import FieldConfig, field_config_from
+from vfr_bake.data.scene import WHITE
 from vfr_bake.data.view_pixels import SomePixels, ViewPixels
 from vfr_bake.data.witnesses import Witnesses
 from vfr_bake.field.field import VfrField
@@ -56,7 +58,7 @@ if TYPE_CHECKING:
     from vfr_bake.training.trainer import Trainer
 
 FORMAT = "vfr-model"
-VERSION = (2, 5)
+VERSION = (2, 6)
 N_MEAN_VIEWS = 16
 """Number of cameras, about, spread evenly over all, whose pictures give the mean colour of a scene."""
 
@@ -87,6 +89,8 @@ class Model:
     training_pixels: ViewPixels | None = None
     """Pixels of the training views that training has learned from, and that a bake learns from too; None in
     models of versions without them."""
+    object_background: tuple[float, float, float] = WHITE
+    """What was behind an object in training, sRGB in [0, 1]."""
 
     @property
     def occupancy(self) -> OccupancyGrid:
@@ -97,12 +101,12 @@ class Model:
 
     @cached_property
     def background(self) -> np.ndarray:
-        """[3] float32: default background, sRGB. It is white where pictures have alpha and for objects, as
-        usual for NeRF-synthetic. In other unbounded scenes it is the mean colour that the cameras see,
-        because the background shows there through holes in what is reconstructed, where white would stand
-        out."""
+        """[3] float32: default background, sRGB. It is white where pictures have alpha, as usual for
+        NeRF-synthetic, and behind opaque pictures of an object what they were trained over. In other
+        unbounded scenes it is the mean colour that the cameras see, because the background shows there
+        through holes in what is reconstructed, where white would stand out."""
         if self.has_alpha or not self.field.config.unbounded:
-            return np.ones(3, np.float32)
+            return np.array(self.object_background, np.float32)
         cameras = self.model_cameras()
         some = cameras[:: max(1, len(cameras) // N_MEAN_VIEWS)]
         seen = mean_colour(self.field, self.sampler, some)
@@ -163,6 +167,7 @@ def trained_model(trainer: Trainer, scene: Scene, figures: dict[str, Any]) -> Mo
         figures=figures,
         witnesses=trainer.witnesses,
         training_pixels=trainer.training_pixels(),
+        object_background=scene.background,
     )
     if not trainer.effects.exposure_on:
         return model
@@ -198,6 +203,7 @@ def save_model(path: Path, model: Model) -> None:
         "sampler": _sampler_content(model.sampler),
         "state": model.field.state_dict(),
         "figures": model.figures,
+        "object_background": list(model.object_background),
     }
     if model.witnesses is not None:
         content["witnesses"] = pixel_content(model.witnesses)
@@ -244,6 +250,11 @@ def load_model(path: Path, max_memory: float | None = None) -> Model:
     exposure = None
     if "exposure" in content:
         exposure = restore_colours(content["exposure"], len(cameras), f"{path}: exposure")
+    background = content.get("object_background", list(WHITE))
+    if not (isinstance(background, list) and len(background) == 3 and all(map(_is_level, background))):
+        raise FormatError(
+            f"{path}: object_background: expected 3 numbers from 0 to 1, got {brief(background)}"
+        )
     return Model(
         field=field,
         sampler=sampler,
@@ -255,7 +266,12 @@ def load_model(path: Path, max_memory: float | None = None) -> Model:
         witnesses=witnesses,
         exposure=exposure,
         training_pixels=training_pixels,
+        object_background=(background[0], background[1], background[2]),
     )
+
+
+def _is_level(value: Any) -> bool:
+    return isinstance(value, float) and 0 <= value <= 1
 
 
 def _read(path: Path, max_memory: float | None) -> dict[str, Any]:

@@ -42,9 +42,8 @@ class Preview:
         number = int(candidates[len(candidates) // 2]) if len(candidates) else len(views.cameras) // 2
         self._camera = camera = views.cameras[number].at_most(SIDE)
         rgba = views.images[number]
-        # Over white where pictures have alpha, as is usual for data sets of objects; else over the mean
-        # colour.
-        self._background = np.ones(3) if scene.has_alpha else rgba[..., :3].mean(axis=(0, 1)) / 255
+        mean = rgba[..., :3].mean(axis=(0, 1)) / 255
+        self._background = mean if scene.unbounded else np.array(scene.background)
         whole = Image.fromarray(to_8_bit(over_background(rgba, self._background)))
         self._photograph = np.asarray(whole.resize((camera.width, camera.height), Image.Resampling.BOX)) / 255
         self._path = path

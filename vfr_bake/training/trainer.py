@@ -122,7 +122,7 @@ class Trainer:
         self._random_background = scene.has_alpha or scene.unbounded
         self._views = scene.train
         self._masked = scene.masked
-        self._background = None if scene.unbounded and not scene.has_alpha else np.ones(3)
+        self._background = None if scene.unbounded and not scene.has_alpha else np.array(scene.background)
         # Not without alpha: there, only plain pixels of the background show that space is empty. Not on a
         # GPU: its batches are so large that they have enough detail anyway.
         self._by_detail = scene.has_alpha and self.device.type == "cpu"
@@ -338,7 +338,7 @@ class Trainer:
         if self._random_background:
             background = torch.rand(n_rays, 3, generator=self._generator, device=self.device)
         else:
-            background = torch.ones(n_rays, 3, device=self.device)
+            background = torch.tensor(self._background, device=self.device).float().repeat(n_rays, 1)
         chances = torch.rand(n_rays, generator=self._generator, device=self.device)
         share = self.processes.share
         return Batch(*(share(rows) for rows in (*vars(rays).values(), jitter, background, chances)))

@@ -11,7 +11,7 @@ import pytest
 from player.errors import DataError, ShapeError
 from vfr_bake.data.capture import Capture, PosedImages
 from vfr_bake.data.demo import demo_cameras, demo_views
-from vfr_bake.data.scene import NEAR_CAMERA, NEAR_QUANTILE, NEAR_SHARE, _near, build_scene
+from vfr_bake.data.scene import NEAR_CAMERA, NEAR_QUANTILE, NEAR_SHARE, WHITE, _near, build_scene
 from vfr_bake.data.store.working import WorkingSize
 
 
@@ -79,10 +79,12 @@ def opaque(views: PosedImages, colour: list[int] | None) -> PosedImages:
 def test_the_kind_of_scene_is_seen_and_can_be_overruled():
     train, test = demo_views(24, 10, 2)
     assert not build_scene(Capture("alpha", train, test)).unbounded
-    for colour in ([0, 0, 0], [255, 255, 255]):
-        assert not build_scene(Capture("plain", opaque(train, colour), opaque(test, colour))).unbounded
+    for colour in ([0, 0, 0], [51, 102, 204], [255, 255, 255]):
+        scene = build_scene(Capture("plain", opaque(train, colour), opaque(test, colour)))
+        assert not scene.unbounded and scene.background == pytest.approx([level / 255 for level in colour])
+    assert build_scene(Capture("alpha", opaque(train, [0, 0, 0]), test), "unbounded").background == WHITE
     around = Capture("around", opaque(train, None), opaque(test, None))
-    assert build_scene(around).unbounded
+    assert build_scene(around).unbounded and build_scene(around, "object").background == WHITE
     assert not build_scene(around, "object").unbounded
     assert build_scene(Capture("alpha", train, test), "unbounded").unbounded
 

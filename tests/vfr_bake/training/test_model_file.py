@@ -91,6 +91,17 @@ def test_a_model_of_before_there_were_witnesses_still_loads(saved: Path) -> None
         again.witness_rays()
 
 
+def test_what_was_behind_an_object_comes_back(model: Model, saved: Path) -> None:
+    """The background that an object was trained over is loaded as it was saved; it was white before version
+    2.6."""
+    save_model(saved, replace(model, object_background=(0.25, 0.5, 0.0)))
+    assert load_model(saved).background.tolist() == [0.25, 0.5, 0.0]
+    content = torch.load(saved, weights_only=True)
+    del content["object_background"]
+    torch.save(content | {"version": [2, 5]}, saved)
+    assert load_model(saved).background.tolist() == [1, 1, 1]
+
+
 def test_training_pixels_come_back(model: Model, saved: Path) -> None:
     """Training pixels are loaded as they were saved; a model from before there were any has none."""
     assert load_model(saved).training_pixels is None
@@ -217,6 +228,10 @@ def test_cut_short(saved: Path, share: float) -> None:
         ({"witnesses": witnesses(whole=[-1])}, "whole: expected ascending numbers"),
         ({"witnesses": witnesses(whole=[0, 1])}, "whole: expected ascending numbers"),
         ({"witnesses": witnesses(whole=[[0]])}, "whole: expected ascending numbers"),
+        ({"object_background": None}, "object_background: expected 3 numbers from 0 to 1, got None"),
+        ({"object_background": [0.5, 1.0]}, "object_background: expected 3 numbers from 0 to 1"),
+        ({"object_background": [0.5, 1.5, 0.5]}, "object_background: expected 3 numbers from 0 to 1"),
+        ({"object_background": [0.5, float("nan"), 0.5]}, "object_background: expected 3 numbers"),
         ({"training_pixels": None}, "training_pixels: expected dict, got NoneType"),
         ({"training_pixels": witnesses(counts=[2.0, 3.0])}, "training_pixels: counts: expected a plain"),
         ({"training_pixels": witnesses(counts=[6, -1])}, "training_pixels: counts: expected 5 pixels"),
