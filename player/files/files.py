@@ -110,8 +110,9 @@ def _inside(path: Path, folder: Path) -> Path:
 
 
 def check_target(path: Path, force: bool = False, is_file: bool = False) -> None:
-    """Raise OutputError if a target exists, unless `force`, or if it or its folder is read-only. This is
-    called before long work, so that nobody waits for an error that could have come at once.
+    """Raise OutputError if a target exists, unless `force`, if it or its folder is read-only, or if it is a
+    folder that cannot be replaced, the current one or a root. This is called before long work, so that nobody
+    waits for an error that could have come at once.
 
     `is_file`: whether a file is to be written, which never replaces a folder.
 
@@ -120,9 +121,14 @@ def check_target(path: Path, force: bool = False, is_file: bool = False) -> None
     >>> check_target(Path("surely/not/there.png"))
     """
     try:
-        clear_up(path.parent)
+        clear_up(_named(path).parent)
         if is_file and path.is_dir():
             raise OutputError(f"{path}: expected a file to write, got a folder: name a file in it")
+        if path.is_dir() and path.samefile(Path.cwd()):  # whoever is in it would be left in the old one
+            raise OutputError(
+                f"{path}: expected a new folder, got the current one, which cannot be replaced: name one "
+                "in it"
+            )
         if path.exists() and not force:
             raise OutputError(f"{path}: already exists: add --force to replace it")
         if path.exists() and not os.access(path, os.W_OK):
@@ -136,6 +142,17 @@ def check_target(path: Path, force: bool = False, is_file: bool = False) -> None
         raise OutputError(f"{path}: cannot write: {above} is a file, not a folder")
     if not _takes_files(above):
         raise OutputError(f"{path}: cannot write: the folder {above} is read-only")
+
+
+def _named(path: Path) -> Path:
+    """Return `path` as a path that ends in a name: whole if it is "." or "..". Raises OutputError for a root,
+    which has none."""
+    place = path.resolve() if path.name in ("", "..") else path
+    if not place.name:
+        raise OutputError(
+            f"{path}: expected a file or a folder to write, got the root of a disk: name one in it"
+        )
+    return place
 
 
 def _takes_files(folder: Path) -> bool:
@@ -198,6 +215,8 @@ def write_together(files: dict[Path, bytes]) -> None:
 @contextmanager
 def _writing(path: Path) -> Iterator[None]:
     """Create the folder of `path` and hold it (`held`); turn errors of the system into an OutputError."""
+    if path.name in ("", ".."):
+        raise OutputError(f"{path}: cannot write: it is a folder")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with held(path.parent):
@@ -242,6 +261,7 @@ def new_folder(path: Path, force: bool = False) -> Iterator[Path]:
     can do this (`player.files.replace`). Raises OutputError: `path` exists, full disk, read-only folder, ...
     """
     check_target(path, force)
+    path = _named(path)
     with _writing(path), _temporary_folder(path) as temporary:
         yield temporary
         sync_all(temporary)

@@ -139,6 +139,34 @@ def test_a_folder_is_not_replaced_by_a_file(tmp_path: Path) -> None:
             check_target(tmp_path, force, is_file=True)
 
 
+@pytest.mark.parametrize("force", [False, True])
+def test_the_current_folder_and_a_root_are_refused(
+    force: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whoever is in a folder that is replaced would be left in the old one; a root has no name to give."""
+    monkeypatch.chdir(tmp_path)
+    for path in (Path(), tmp_path, Path("../") / tmp_path.name):
+        with pytest.raises(OutputError, match="expected a new folder, got the current one, which cannot"):
+            check_target(path, force)
+        with pytest.raises(OutputError, match="got the current one"), new_folder(path, force):
+            pytest.fail("the block was entered")
+    with pytest.raises(OutputError, match="got the root of a disk: name one in it"):
+        check_target(Path(tmp_path.anchor), force)
+    for path in (Path(), Path("..")):
+        with pytest.raises(OutputError, match="cannot write: it is a folder"):
+            write_bytes(path, b"data")
+    assert names(tmp_path) == []
+
+
+def test_a_folder_that_is_named_from_within_another(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "site" / "in it").mkdir(parents=True)
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    with new_folder(Path("../site/in it/.."), force=True) as folder:
+        (folder / "file").write_bytes(b"data")
+    assert tree(tmp_path / "site") == {"file": b"data"} and names(tmp_path) == ["elsewhere", "site"]
+
+
 # --- write_bytes ---
 
 
