@@ -24,6 +24,11 @@ from player.errors import ConfigError
 
 PICTURES = (".png", ".webp")
 VIDEO = ".mp4"
+NOT_WRITTEN = (
+    *(".jpg", ".jpeg", ".gif", ".apng", ".avif", ".heic", ".bmp", ".tif", ".tiff", ".exr"),
+    *(".mov", ".m4v", ".webm", ".mkv", ".avi"),
+)
+"""Suffixes of other pictures and videos: whoever writes one does not mean a folder."""
 
 if TYPE_CHECKING:  # the command line answers `--help` without numpy
     from player.render import Background, March, Quality
@@ -101,6 +106,11 @@ class PlaySettings:
         suffix = self.output.suffix.lower()
         if self.resume and self.force:
             raise ConfigError("--resume: not allowed with --force, which renders everything anew")
+        if suffix in NOT_WRITTEN:
+            raise ConfigError(
+                f"--output: expected a folder, a picture ({', '.join(PICTURES)}) or a video ({VIDEO}), "
+                f"got {self.output.name}"
+            )
         if self.format is not None and suffix in (*PICTURES, VIDEO):
             raise ConfigError(f"--format: {self.output.name} says which format it is")
         if self.background == "transparent" and suffix == VIDEO:

@@ -230,6 +230,13 @@ def test_check_looks_into_files_whose_checksums_hold(
         (["--port", "65536"], "expected a whole number, 1 to 65535, such as 8080, got '65536'"),
         (["--orbit", "3", "--output", "o", "--resume", "--force"], "--resume: not allowed with --force"),
         (["--orbit", "3", "--output", "o.mp4", "--format", "png"], "--format: o.mp4 says"),
+        *(
+            (
+                ["--orbit", "3", "--output", name],
+                f"--output: expected a folder, a picture (.png, .webp) or a video (.mp4), got {name}",
+            )
+            for name in ("view.jpg", "turn.GIF", "turn.webm", "turn.mov")
+        ),
         (["--orbit", "3", "--output", "o", "--fps", "3"], "--fps: expected a video"),
         (
             ["--orbit", "3", "--output", "o.mp4", "--fps", "0"],
