@@ -39,7 +39,7 @@ class Train:
     """With --check: the page to write; DATA_check.html in the current folder if not given."""
     config: TrainConfig = field(default_factory=TrainConfig)
     force: bool = False
-    """Replace the model file, or the page of --check, if it exists."""
+    """Replace an earlier model, or with --check an earlier page. Another file is never replaced."""
     no_cache: bool = False
     """Do not keep the pictures, reduced and decoded, for the next run with them (docs/train.md), and remove
     them if they are kept."""
@@ -76,7 +76,7 @@ class Bake:
     --max-memory alone has a meaning."""
     config: BakeConfig = field(default_factory=BakeConfig)
     force: bool = False
-    """Replace the folder if it exists."""
+    """Replace the folder if it exists, and holds an asset and nothing else."""
     json: Path | None = None
     """Also write what was measured as JSON to this file; - for stdout."""
 
@@ -128,4 +128,4 @@ class Bench(BenchConfig):
     json: Path | None = None
     """Also write everything as JSON to this file; - for stdout, instead of the table."""
     force: bool = False
-    """Replace the files if they exist."""
+    """Replace an earlier page and earlier results. Other files are never replaced."""

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from player.asset.asset import Asset, GridArrays, write_asset
-from player.files.files import check_target
+from player.asset.target import check_asset_target
 from player.progress import Progress
 from vfr_bake.baking.coarser_levels import with_coarser_levels
 
@@ -38,17 +38,17 @@ def convert(
         old: the folder of an asset; every file in it has to be complete.
         new: the folder to write.
         max_memory: gigabytes that the asset may take in memory; None allows half of the machine's memory.
-        force: replace `new` if it exists.
+        force: replace `new` if it exists, and holds an asset and nothing else.
         progress: called with (steps done, steps in all).
 
     Raises:
         FormatError, IntegrityError: `old` is not an asset, or one of its files is broken.
         ConfigError: the asset takes more memory than is allowed.
-        OutputError: `new` exists, or cannot be written.
+        OutputError: `new` exists, or holds something else than an asset, or cannot be written.
     """
     begin = time.perf_counter()
     tell = progress or (lambda done, total: None)
-    check_target(new, force)
+    check_asset_target(new, force)
     asset = Asset.open(old, verify=True, max_memory=max_memory)
     tell(1, STEPS)
     densities = with_coarser_levels(asset.arrays.densities, "densities")

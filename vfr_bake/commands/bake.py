@@ -7,15 +7,15 @@ from dataclasses import asdict
 from typing import Any
 
 from player.app.commands import write_result
+from player.asset.target import check_asset_target
 from player.errors import ConfigError
-from player.files.files import check_target
 from player.progress import Bar, Bars
 from vfr_bake.config import BakeConfig
 
 
 def bake_command(options: Any) -> int:
     """Bake as `options` says (`vfr_bake.options.Bake`), or convert an asset; return the exit code."""
-    check_target(options.asset, options.force)
+    check_asset_target(options.asset, options.force)
     if options.convert:
         return _convert(options)
     from player.proof import prove

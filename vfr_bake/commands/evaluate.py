@@ -8,9 +8,9 @@ from dataclasses import asdict, replace
 from typing import Any
 
 from player.app.commands import write_result
-from player.errors import DataError
-from player.files.files import check_target, write_bytes
+from player.files.files import write_bytes
 from player.progress import Bar, Bars
+from vfr_bake.commands.targets import check_json_target, check_page_target
 
 
 def eval_command(options: Any) -> int:
@@ -70,9 +70,9 @@ def bench_command(options: Any) -> int:
     from vfr_bake.training.scores.lpips import Lpips
 
     options.check()
-    for target in (options.html, options.json):
-        if target is not None and str(target) != "-":
-            check_target(target, options.force, is_file=True)
+    if options.html is not None:
+        check_page_target(options.html, options.force)
+    check_json_target(options.json, options.assets, options.html, options.force)
     lpips = None if options.lpips is None else Lpips(options.lpips)
     with Bars() as bars:
         trade = measure_trade(options, lpips, bars.count)

@@ -16,6 +16,7 @@ from player.files.files import check_target, write_bytes
 from player.progress import Bar, Bars
 from player.terminal import printable
 from vfr_bake.commands.evaluate import finite
+from vfr_bake.commands.targets import check_model_target, check_page_target
 from vfr_bake.config import TrainConfig
 
 if TYPE_CHECKING:
@@ -46,7 +47,7 @@ def train_command(options: Any) -> int:
     if options.model is None:
         print("vfr-train: expected a model file to write, or --check; see vfr-train --help", file=sys.stderr)
         return 2
-    check_target(options.model, options.force, is_file=True)
+    check_model_target(options.model, options.force)
     config = options.config
     processes = Processes.from_environment()
     # The pictures of a ZIP or a video can be looked at only once they are unpacked.
@@ -102,7 +103,7 @@ def _check(options: Any) -> int:
 
     page = options.html or Path(f"{Path(options.data).resolve().stem}_check.html")
     ours = page.is_file() and MARK.encode() in page.read_bytes()[:200]
-    check_target(page, options.force or ours, is_file=True)
+    check_page_target(page, options.force or ours)
     with Bar("looking") as bar:
         check = check_data(options.data, working_size(options.config), progress=bar.count)
     write_bytes(page, check_page(check))

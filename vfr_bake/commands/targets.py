@@ -1,0 +1,98 @@
+"""What the commands may write to, checked before any work: what is there is replaced only if it is an earlier
+result of the same kind."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from pathlib import Path
+from zipfile import ZIP_STORED, BadZipFile, ZipFile
+
+from player.app.commands import check_result
+from player.asset.target import asset_files
+from player.errors import FormatError, OutputError
+from player.files.files import check_target
+from player.files.json_files import parse_json, read_json
+
+RESULTS = (
+    {"model", "steps", "seconds"},  # vfr-train
+    {"page", "verdict", "advice"},  # vfr-train --check
+    {"asset", "megabytes", "seconds"},  # vfr-bake
+    {"psnr", "per_view", "n_views"},  # vfr-eval
+    {"conditions", "recommendation"},  # vfr-bench
+)
+"""Keys by which a JSON file is known as the result of a command."""
+
+
+def check_model_target(path: Path, force: bool) -> None:
+    """Raise OutputError if a model cannot be written to `path`. With `force`, a model or an empty file is
+    replaced, and nothing else."""
+    check_target(path, force, is_file=True)
+    if _has_content(path) and not _is_model(path):
+        raise OutputError(
+            f"{path}: expected a new file or an earlier model, got another file: name a new one"
+        )
+
+
+def check_page_target(path: Path, force: bool) -> None:
+    """Raise OutputError if a web page cannot be written to `path`. With `force`, a page or an empty file is
+    replaced, and nothing else."""
+    check_target(path, force, is_file=True)
+    if _has_content(path):
+        with path.open("rb") as file:
+            if file.read(9).lower() != b"<!doctype":
+                raise OutputError(
+                    f"{path}: expected a new file or an earlier page, got another file: name a new one"
+                )
+
+
+def check_json_target(
+    path: Path | None, inputs: Collection[Path], output: Path | None = None, force: bool = True
+) -> None:
+    """Raise OutputError if the result of a command cannot be written to `path` (--json).
+
+    Args:
+        path: a file; None and "-" are no file.
+        inputs: files and folders that the command reads, as for `check_result`.
+        output: a file or folder that the command writes; the result may be neither it nor in it.
+        force: whether an earlier result is replaced; nothing else ever is.
+    """
+    if path is None or str(path) == "-":
+        return
+    check_result(path, inputs)
+    check_target(path, force, is_file=True)
+    if output is not None and path.resolve().is_relative_to(output.resolve()):
+        raise OutputError(f"{path}: --json: expected a file outside {output}, which is written, too")
+    if asset_files(path.parent) is not None:
+        raise OutputError(f"{path}: --json: expected a file outside the asset {path.parent}")
+    if _has_content(path) and not _is_result(path):
+        raise OutputError(
+            f"{path}: --json: expected a new file or an earlier result, got another file: name a new one"
+        )
+
+
+def _has_content(path: Path) -> bool:
+    return path.exists() and (not path.is_file() or path.stat().st_size > 0)
+
+
+def _is_model(path: Path) -> bool:
+    """Return whether a file is a model of whatever version. Only its description is read."""
+    from vfr_bake.training.model_file import FORMAT
+
+    try:
+        with ZipFile(path) as archive:
+            return any(
+                entry.filename.endswith("data.pkl")
+                and entry.compress_type == ZIP_STORED
+                and FORMAT.encode() in archive.read(entry)
+                for entry in archive.infolist()
+            )
+    except (BadZipFile, OSError):
+        return False
+
+
+def _is_result(path: Path) -> bool:
+    try:
+        document = parse_json(read_json(path, "a result"), str(path))
+    except FormatError:
+        return False
+    return isinstance(document, dict) and any(keys <= set(document) for keys in RESULTS)
