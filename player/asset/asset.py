@@ -21,6 +21,7 @@ from player.asset.manifest import (
     FileEntry,
     Manifest,
     manifest_bytes,
+    needed_files,
     parse_manifest,
 )
 from player.asset.parts import DTYPES, PartsReader
@@ -109,10 +110,10 @@ class Asset:
 
         Args:
             folder: the asset's folder; its files must be regular files inside it.
-            verify: first compare the checksum of every file, which reads every byte, and raise if any part
-                cannot be decoded. If False, a file is compared when it is read: now the parts, later the head
-                and the cameras. A part after the first that is missing, cut short, changed or broken is then
-                no error: `asset.missing` says so.
+            verify: first compare the checksum of every file that the manifest lists, which reads every byte,
+                and raise if any part cannot be decoded. If False, a file is compared when it is read: now the
+                parts, later the head and the cameras. A part after the first that is missing, cut short,
+                changed or broken is then no error: `asset.missing` says so.
             max_memory: gigabytes that the asset may take, unpacked and arranged for marching. If None, half
                 of what the machine has.
             parts: number of parts to read, 1 or more: the fewer, the coarser the picture and the sooner it
@@ -222,8 +223,8 @@ class _Opening:
         self._verify, self._allowed = verify, allowed_bytes(max_memory)
         self.manifest = read_manifest(folder)
         self._folder = folder = folder.absolute()
-        may_lack = set() if verify else {part.file for part in self.manifest.parts[1:]}
-        needed = {name: entry for name, entry in self.manifest.files.items() if name not in may_lack}
+        files = self.manifest.files
+        needed = files if verify else {name: files[name] for name in needed_files(self.manifest.version)}
         check_files(folder, needed, self._allowed)
         if verify:
             for name, entry in needed.items():

@@ -101,8 +101,8 @@ class Manifest:
 
     >>> manifest = Manifest(generator="doctest", resolution=8, feature_resolution=4, step=0.2,
     ...     density_range=(-5, 5), n_channels=4, view_size=(4, 3))
-    >>> parse_manifest(manifest_bytes(manifest), "manifest.json", complete=False) == manifest
-    True
+    >>> json.loads(manifest_bytes(manifest))["density_range"]
+    [-5.0, 5.0]
     """
 
     generator: str
@@ -147,13 +147,17 @@ class Manifest:
         return {"densities": self.resolution, "features": self.feature_resolution}
 
 
-def parse_manifest(data: bytes, where: str, complete: bool = True) -> Manifest:
+def needed_files(version: tuple[int, ...]) -> tuple[str, ...]:
+    """Return the names of the files that every asset of a version has."""
+    return FILES if version >= (4, 0) else FILES_OF_3
+
+
+def parse_manifest(data: bytes, where: str) -> Manifest:
     """Parse the bytes of `manifest.json`.
 
     Args:
         data: the file's bytes.
         where: the file's name in error messages.
-        complete: whether every file of the format must be listed.
 
     Raises:
         VersionError: written for another major version.
@@ -186,8 +190,7 @@ def parse_manifest(data: bytes, where: str, complete: bool = True) -> Manifest:
             f"{where}: {ascii(unknown[0])[1:-1][:80]}: expected no such key in version {list(version)}"
         )
     values = {key: _PARSERS[key](f"{where}: {key}", document[key]) for key in known & set(document)}
-    if complete:
-        _check_files(f"{where}: files", version, values["files"], values["parts"])
+    _check_files(f"{where}: files", version, values["files"], values["parts"])
     return Manifest(**values)
 
 
@@ -212,10 +215,9 @@ def _check_files(
 ) -> None:
     """Raise FormatError unless every file that the version must have is listed, and each part is as large as
     its sections together."""
-    needed = FILES if version >= (4, 0) else FILES_OF_3
     if version >= (4, 0) and not parts:
         raise FormatError(f"{where.removesuffix(': files')}: parts: expected at least one, got none")
-    for name in (*needed, *(part.file for part in parts)):
+    for name in (*needed_files(version), *(part.file for part in parts)):
         if name not in files:
             raise FormatError(f"{where}: expected {name}, got {sorted(files)}")
     for part in parts:

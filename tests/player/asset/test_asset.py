@@ -68,6 +68,16 @@ def test_what_is_added_at_the_end_is_listed_and_a_failure_there_leaves_nothing(
     assert [path.name for path in tmp_path.iterdir()] == ["a"]
 
 
+def test_files_that_no_player_reads_may_be_missing(asset: Asset, tmp_path: Path) -> None:
+    """A report is for people; whoever copies an asset may leave it out."""
+    write_asset(tmp_path / "a", *parts(asset), finish=lambda _: {"report.json": b"{}", "notes.txt": b"n"})
+    (tmp_path / "a" / "report.json").unlink()
+    (tmp_path / "a" / "notes.txt").write_text("other notes")
+    assert Asset.open(tmp_path / "a").missing is None
+    with pytest.raises(IntegrityError, match=r"notes\.txt: size"):
+        Asset.open(tmp_path / "a", verify=True)
+
+
 def test_an_asset_moves(broken_folder: Path, tmp_path: Path) -> None:
     broken_folder.rename(tmp_path / "elsewhere")
     assert Asset.open(tmp_path / "elsewhere", verify=True).path("mesh.ply").is_file()
