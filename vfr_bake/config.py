@@ -259,7 +259,8 @@ class TrainConfig:
     """Seed of every random number."""
     eval_views: int | None = None
     """Test views rendered at the end, spread evenly; 0 for none. Objects 10, scenes 3, a view of which takes
-    half a minute. `vfr-eval` renders them all."""
+    half a minute; fewer if they would take more than a fifth of the training's time. `vfr-eval` renders them
+    all."""
     checkpoint_minutes: float = 2.0
     """Minutes between two checkpoints, kept beside the model file until training is complete."""
     field: FieldOptions = field(default_factory=FieldOptions)

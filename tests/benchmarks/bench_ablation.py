@@ -22,7 +22,7 @@ from vfr_bake.config import FieldOptions, TrainConfig
 from vfr_bake.data import load_scene
 from vfr_bake.data.scene import Scene
 from vfr_bake.training.model_file import trained_model
-from vfr_bake.training.scores.evaluation import evaluate
+from vfr_bake.training.scores.evaluation import evenly, render_views
 from vfr_bake.training.trainer import Trainer
 
 ROWS: dict[str, dict[str, Any]] = {
@@ -47,10 +47,12 @@ def train(scene: Scene, row: str, seed: int, options: argparse.Namespace) -> dic
         if sys.stderr.isatty():
             print(f"\r{row} seed {seed} {report.progress:.0%}", end="", file=sys.stderr)
     seconds = time.monotonic() - begin
-    scores = list(evaluate(trained_model(trainer, scene, {}), scene.test, options.views))
+    model, n_views = trained_model(trainer, scene, {}), len(scene.test.cameras)
+    chosen = evenly(n_views, options.views)
+    scores = [view.score() for view in render_views(model, scene.test, chosen)]
     return {
         "psnr": float(np.mean([score.psnr for score in scores])),
-        "ssim": float(np.mean([score.ssim for score in scores])),
+        "ssim": float(np.mean([score.ssim for score in scores if score.ssim is not None])),
         "seconds": seconds,
     }
 

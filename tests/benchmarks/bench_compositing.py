@@ -20,7 +20,7 @@ from vfr_bake.config import Compositing, FieldOptions, TrainConfig
 from vfr_bake.data import load_scene
 from vfr_bake.data.scene import Scene
 from vfr_bake.training.model_file import trained_model
-from vfr_bake.training.scores.evaluation import evaluate
+from vfr_bake.training.scores.evaluation import evenly, render_views
 from vfr_bake.training.trainer import Trainer
 
 KINDS: tuple[Compositing, ...] = ("features", "colour")
@@ -68,7 +68,9 @@ def main() -> None:
     found = {}
     for kind, run in runs.items():
         trainer = run.trainer
-        scores = list(evaluate(trained_model(trainer, scene, {}), scene.test, options.views))
+        model, n_views = trained_model(trainer, scene, {}), len(scene.test.cameras)
+        chosen = evenly(n_views, options.views)
+        scores = [view.score() for view in render_views(model, scene.test, chosen)]
         rate = trainer.next_step / trainer.seconds
         psnr = float(np.mean([score.psnr for score in scores]))
         found[kind] = {"steps": trainer.next_step, "steps_a_second": rate, "psnr": psnr}

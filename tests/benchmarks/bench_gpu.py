@@ -22,7 +22,7 @@ from torch.profiler import ProfilerActivity, profile, record_function
 from vfr_bake.config import TrainConfig
 from vfr_bake.data import load_scene
 from vfr_bake.training.model_file import trained_model
-from vfr_bake.training.scores.evaluation import evaluate
+from vfr_bake.training.scores.evaluation import evenly, render_views
 from vfr_bake.training.trainer import StepReport, Trainer
 
 PARTS = {
@@ -113,7 +113,9 @@ def main() -> None:
         "samples_per_second": n_samples / last.seconds,
         "gigabytes": torch.cuda.max_memory_allocated() / 1e9,
     }
-    scores = list(evaluate(trained_model(trainer, scene, {}), scene.test, options.views))
+    model, n_views = trained_model(trainer, scene, {}), len(scene.test.cameras)
+    chosen = evenly(n_views, options.views or n_views)
+    scores = [view.score() for view in render_views(model, scene.test, chosen)]
     figures["psnr"] = float(np.mean([score.psnr for score in scores])) if scores else None
     for name, value in figures.items():
         print(f"| {name} | {value if isinstance(value, str) or value is None else format(value, ',.2f')} |")

@@ -13,7 +13,6 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -377,9 +376,8 @@ def test_a_training_that_was_complete_already_gives_a_model_that_bakes(
 
 
 def test_test_views_without_error_are_null_in_json(model: Path, small_data: Path, monkeypatch) -> None:
-    scores = [SimpleNamespace(psnr=np.inf)]
-    monkeypatch.setattr("vfr_bake.training.scores.evaluation.evaluate", lambda *_, **__: iter(scores))
-    figures = _test_figures(load_model(model), load_scene(small_data), 1)
+    monkeypatch.setattr("vfr_bake.training.scores.evaluation.quick_psnr", lambda *_: ([np.inf], []))
+    figures = _test_figures(load_model(model), load_scene(small_data), 1, np.inf)
     assert figures["test_psnr"] is None and figures["test_views"] == 1
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 import time
 from collections.abc import Callable
@@ -16,7 +17,7 @@ from player.files.files import check_target, write_bytes
 from player.progress import Bar, Bars
 from player.terminal import printable
 from vfr_bake.commands.evaluate import finite
-from vfr_bake.commands.targets import check_model_target, check_page_target
+from vfr_bake.commands.targets import check_json_target, check_model_target, check_page_target
 from vfr_bake.config import TrainConfig
 
 if TYPE_CHECKING:
@@ -28,6 +29,9 @@ if TYPE_CHECKING:
 
 EVAL_VIEWS = {False: 10, True: 3}
 """Number of test views rendered at the end if none is asked for, by whether the scene is unbounded."""
+EVAL_SHARE, LEAST_EVAL_SECONDS = 0.2, 60.0
+"""If none is asked for, test views take at most this share of the training's time, or these seconds if that
+is more: then fewer are rendered, but at least one."""
 
 GLANCED_AT = 24
 """Most pictures that a run looks at before it begins; `--check` looks at as many as ten seconds allow."""
@@ -48,6 +52,7 @@ def train_command(options: Any) -> int:
         print("vfr-train: expected a model file to write, or --check; see vfr-train --help", file=sys.stderr)
         return 2
     check_model_target(options.model, options.force)
+    check_json_target(options.json, [], options.model)
     config = options.config
     processes = Processes.from_environment()
     # The pictures of a ZIP or a video can be looked at only once they are unpacked.
@@ -84,9 +89,12 @@ def train_command(options: Any) -> int:
     if processes.first:
         model = trained_model(trainer, scene, figures)
         save_model(options.model, model)
-        n_views = config.eval_views if config.eval_views is not None else EVAL_VIEWS[scene.unbounded]
+        n_views, most_seconds = config.eval_views, math.inf
+        if n_views is None:
+            n_views = EVAL_VIEWS[scene.unbounded]
+            most_seconds = max(EVAL_SHARE * figures["seconds"], LEAST_EVAL_SECONDS)
         if not interrupted and n_views and scene.test.cameras:
-            figures |= _test_figures(model, scene, n_views)
+            figures |= _test_figures(model, scene, n_views, most_seconds)
             save_model(options.model, replace(model, figures=figures))
         checkpoint.unlink(missing_ok=True)
         for line in [*trainer.effects.described(), *(witnesses.lines() if witnesses else ())]:
@@ -104,6 +112,7 @@ def _check(options: Any) -> int:
     page = options.html or Path(f"{Path(options.data).resolve().stem}_check.html")
     ours = page.is_file() and MARK.encode() in page.read_bytes()[:200]
     check_page_target(page, options.force or ours)
+    check_json_target(options.json, [], page)
     with Bar("looking") as bar:
         check = check_data(options.data, working_size(options.config), progress=bar.count)
     write_bytes(page, check_page(check))
@@ -292,19 +301,15 @@ def _report_training(options: Any, figures: dict[str, Any], interrupted: bool) -
     )
 
 
-def _test_figures(model: Model, scene: Scene, n_views: int) -> dict[str, Any]:
-    import numpy as np
+def _test_figures(model: Model, scene: Scene, n_views: int, most_seconds: float) -> dict[str, Any]:
+    from vfr_bake.training.scores.evaluation import quick_psnr
 
-    from vfr_bake.training.scores.evaluation import evaluate
-
-    scores = []
-    n_views = min(n_views, len(scene.test.cameras))
     with Bar("test views") as bar:
-        for score in evaluate(model, scene.test, n_views, masked=scene.masked):
-            scores.append(score.psnr)
-            bar.count(len(scores), n_views)
+        scores, lines = quick_psnr(model, scene, n_views, most_seconds, bar.count)
+    for line in lines:
+        print(f"vfr-train: {line}", file=sys.stderr)
     return {
-        **finite({"test_psnr": float(np.mean(scores))}),
+        **finite({"test_psnr": sum(scores) / len(scores) if scores else None}),
         "test_views": len(scores),
         "background": model.background.tolist(),
     }

@@ -21,7 +21,7 @@ from vfr_bake.rendering.occupancy import OccupancyGrid
 from vfr_bake.training.checkpoint import load_checkpoint, save_checkpoint
 from vfr_bake.training.model_file import load_model, save_model, trained_model
 from vfr_bake.training.processes import Processes
-from vfr_bake.training.scores.evaluation import evaluate
+from vfr_bake.training.scores.evaluation import render_views
 from vfr_bake.training.trainer import Trainer, choose_device
 
 
@@ -30,8 +30,8 @@ def small_scene(kind: str) -> Scene:
 
 
 def psnr(trainer: Trainer, scene: Scene) -> float:
-    scores = evaluate(trained_model(trainer, scene, {}), scene.test)
-    return float(np.mean([score.psnr for score in scores]))
+    views = render_views(trained_model(trainer, scene, {}), scene.test)
+    return float(np.mean([view.score().psnr for view in views]))
 
 
 @pytest.mark.parametrize("kind", ["object", "unbounded"])
@@ -121,7 +121,7 @@ def test_its_model_file_is_any_model_file(kind: str, device: torch.device, tmp_p
         assert torch.equal(tensor, loaded.field.state_dict()[name]), name
     assert loaded.train["device"] == device.type and loaded.train["batch_samples"] == 1024
     assert psnr(trainer, scene) == pytest.approx(
-        np.mean([score.psnr for score in evaluate(loaded, scene.test)]), abs=1e-6
+        np.mean([view.score().psnr for view in render_views(loaded, scene.test)]), abs=1e-6
     )
 
 

@@ -21,7 +21,7 @@ from vfr_bake.data.capture import PosedImages
 from vfr_bake.data.demo import demo_scene
 from vfr_bake.data.scene import Scene
 from vfr_bake.training.model_file import trained_model
-from vfr_bake.training.scores.evaluation import evaluate
+from vfr_bake.training.scores.evaluation import render_views
 from vfr_bake.training.trainer import Trainer
 
 SMALL_GRID = {"n_levels": 8, "max_resolution": 64, "log2_table_size": 14, "density_width": 16}
@@ -59,8 +59,8 @@ def psnr(scene: Scene, pilot_steps: int, seed: int) -> float:
     trainer.field.head.products = torch.float32  # on any machine: the seeds that fail depend on it
     for _ in trainer.run():
         pass
-    scores = evaluate(trained_model(trainer, scene, {}), scene.test)
-    return float(np.mean([score.psnr for score in scores]))
+    views = render_views(trained_model(trainer, scene, {}), scene.test)
+    return float(np.mean([view.score().psnr for view in views]))
 
 
 def test_a_large_head_needs_the_pilot_to_converge(one_thread: None) -> None:

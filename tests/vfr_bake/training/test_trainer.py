@@ -26,7 +26,7 @@ from vfr_bake.training.gradients import CERTAIN, chosen_rays, scale_near_gradien
 from vfr_bake.training.model_file import trained_model
 from vfr_bake.training.optimiser import DENSITY_DECAY
 from vfr_bake.training.rays import RayBatch
-from vfr_bake.training.scores.evaluation import evaluate
+from vfr_bake.training.scores.evaluation import render_views
 from vfr_bake.training.trainer import Trainer
 
 FIELD = FieldOptions(n_levels=8, max_resolution=64, log2_table_size=14, head_width=32, density_width=16)
@@ -44,6 +44,11 @@ def config(**changes: object) -> TrainConfig:
     return TrainConfig(**({"field": FIELD} | settings | changes))  # type: ignore[arg-type]
 
 
+def psnr_of_views(trainer: Trainer, scene: Scene, views: PosedImages) -> list[float]:
+    """Return the PSNR of each of the views in dB."""
+    return [view.score().psnr for view in render_views(trained_model(trainer, scene, {}), views)]
+
+
 @pytest.fixture(scope="module")
 def scene() -> Scene:
     return demo_scene(size=48, n_train=20, n_test=3)
@@ -51,9 +56,9 @@ def scene() -> Scene:
 
 def test_it_learns_the_scene(scene: Scene) -> None:
     trainer = Trainer(scene, config())
-    before = np.mean([s.psnr for s in evaluate(trained_model(trainer, scene, {}), scene.test)])
+    before = np.mean(psnr_of_views(trainer, scene, scene.test))
     reports = list(trainer.run())
-    after = np.mean([s.psnr for s in evaluate(trained_model(trainer, scene, {}), scene.test)])
+    after = np.mean(psnr_of_views(trainer, scene, scene.test))
     assert len(reports) == 220 and trainer.n_bad_steps == 0
     assert after > before + 6 and after > 18
 
@@ -125,6 +130,8 @@ def test_pictures_without_alpha_train_over_their_own_background(scene: Scene) ->
     batch = trainer._draw(500)
     assert (batch.rgba[:, 3] == 1).all() and (batch.background == 1).all()
     assert all(report.loss == report.loss for report in trainer.run()) and trainer.next_step == 5
+    grey = Trainer(replace(photographs, background=(0.25, 0.5, 0.75)), config(steps=5))._draw(500)
+    assert (grey.background == torch.tensor([0.25, 0.5, 0.75])).all()
     for other in (scene, replace(photographs, unbounded=True)):  # else a thin fog would be as good as a wall
         background = Trainer(other, config(steps=5))._draw(500).background
         assert 0 <= background.min() < 0.05 and 0.95 < background.max() < 1
@@ -297,8 +304,7 @@ def test_colours_can_be_composited_instead(scene: Scene) -> None:
     before = [parameter.detach().clone() for parameter in trainer.pilot.parameters()]
     for _ in trainer.run():
         pass
-    scores = evaluate(trained_model(trainer, scene, {}), scene.test)
-    assert np.mean([score.psnr for score in scores]) > 17
+    assert np.mean(psnr_of_views(trainer, scene, scene.test)) > 17
     assert all(torch.equal(a, b) for a, b in zip(before, trainer.pilot.parameters(), strict=True))
 
 
@@ -309,10 +315,7 @@ def test_an_unbounded_scene_is_learnt() -> None:
     trainer = Trainer(scene, config(steps=150, pilot_steps=60, batch_rays=128))
 
     def psnr() -> list[float]:
-        model = trained_model(trainer, scene, {})
-        return [
-            float(np.mean([s.psnr for s in evaluate(model, views)])) for views in (scene.train, scene.test)
-        ]
+        return [float(np.mean(psnr_of_views(trainer, scene, views))) for views in (scene.train, scene.test)]
 
     before = psnr()
     reports = list(trainer.run())

@@ -7,16 +7,20 @@ usual since Martin-Brualla et al., "NeRF in the wild", 2021.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import time
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
+from player.progress import Progress
 from vfr_bake.data.capture import PosedImages
-from vfr_bake.rendering.render import render_rays
+from vfr_bake.data.scene import Scene
+from vfr_bake.rendering.render import render_camera
 from vfr_bake.training.captures.picture_colours import fitted
 from vfr_bake.training.model_file import Model
 from vfr_bake.training.scores.metrics import Distance, ViewScore, over_background, score_view
+from vfr_bake.training.scores.views import hidden_lines, seen_views, spread_order
 
 
 @dataclass(frozen=True)
@@ -42,18 +46,15 @@ class RenderedView:
 
 
 def render_views(
-    model: Model, views: PosedImages, n_views: int = 0, masked: bool = False
+    model: Model, views: PosedImages, chosen: Iterable[int] | None = None, masked: bool = False
 ) -> Iterator[RenderedView]:
-    """Render views (model frame) with the full model: `n_views` of them, spread evenly, or all if it is 0.
+    """Render views (model frame) with the full model: those with the numbers `chosen`, or all.
 
     `masked`: whether pixels that are not opaque are masked.
     """
-    chosen = np.arange(len(views.cameras))
-    if 0 < n_views < len(chosen):
-        chosen = np.linspace(0, len(chosen) - 1, n_views).round().astype(int)
-    for index in chosen:
+    for index in range(len(views.cameras)) if chosen is None else chosen:
         camera, rgba = views.cameras[index], views.images[int(index)]
-        colours, opacity = render_rays(model.field, model.sampler, *camera.rays())
+        colours, opacity = render_camera(model.field, model.sampler, camera)
         rgb = colours + (1 - opacity[:, None]) * model.background
         rendered = rgb.reshape(camera.height, camera.width, 3), opacity
         exposure = model.exposure is not None
@@ -98,13 +99,35 @@ def beside_photograph(
     return RenderedView(name, rgb, photograph, seen, first_column)
 
 
-def evaluate(
-    model: Model,
-    views: PosedImages,
-    n_views: int = 0,
-    lpips: Distance | None = None,
-    masked: bool = False,
-) -> Iterator[ViewScore]:
-    """Yield the scores of the pictures of `render_views`; with `lpips`, that distance as well."""
-    for view in render_views(model, views, n_views, masked):
-        yield view.score(lpips)
+def quick_psnr(
+    model: Model, scene: Scene, n_views: int, most_seconds: float, progress: Progress
+) -> tuple[list[float], list[str]]:
+    """Return the PSNR of `n_views` test views, spread evenly, and lines to print. No further view is begun
+    that is not likely to end within `most_seconds`; one is always scored if something is seen in any.
+
+    `progress`: called with the numbers of views done and to do.
+    """
+    views, hidden = seen_views(scene.test, scene.masked, model.exposure is not None)
+    some = evenly(len(views.cameras), n_views)
+    lines, scores = hidden_lines(hidden), []
+    begin = time.monotonic()
+    for view in render_views(model, views, some[spread_order(len(some))], scene.masked):
+        scores.append(view.score().psnr)
+        progress(len(scores), len(some))
+        seconds = time.monotonic() - begin
+        if len(scores) < len(some) and seconds * (len(scores) + 1) / len(scores) > most_seconds:
+            lines.append(
+                f"scored {len(scores)} of {len(some)} test views, because one takes "
+                f"{seconds / len(scores) / 60:.1f} minutes: vfr-eval scores all"
+            )
+            break
+    return scores, lines
+
+
+def evenly(n_views: int, n_chosen: int) -> np.ndarray:
+    """Return the numbers of `n_chosen` of the views, spread evenly, or of all if there are no more.
+
+    >>> evenly(10, 4).tolist(), evenly(2, 4).tolist()
+    ([0, 3, 6, 9], [0, 1])
+    """
+    return np.linspace(0, n_views - 1, min(n_chosen, n_views)).round().astype(int)

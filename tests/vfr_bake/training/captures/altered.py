@@ -12,7 +12,7 @@ from vfr_bake.data.demo import demo_capture
 from vfr_bake.data.demo_solids import CENTRE, SCALE
 from vfr_bake.data.scene import Scene, build_scene
 from vfr_bake.training.model_file import trained_model
-from vfr_bake.training.scores.evaluation import evaluate
+from vfr_bake.training.scores.evaluation import render_views
 from vfr_bake.training.trainer import Trainer
 
 
@@ -72,5 +72,5 @@ def trained(scene: Scene, **changes: object) -> Trainer:
 
 def quality(trainer: Trainer, scene: Scene) -> float:
     """Return the mean PSNR of the test views in dB."""
-    scores = evaluate(trained_model(trainer, scene, {}), scene.test)
-    return float(np.mean([score.psnr for score in scores]))
+    views = render_views(trained_model(trainer, scene, {}), scene.test)
+    return float(np.mean([view.score().psnr for view in views]))
