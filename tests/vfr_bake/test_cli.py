@@ -146,6 +146,20 @@ def test_eval_says_the_means_and_shows_the_views(
         assert np.array_equal(np.asarray(file)[:, :32], to_8_bit(white))
 
 
+def test_eval_refuses_cameras_that_the_model_was_not_trained_with(
+    model: Path, small_data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    other = shutil.copytree(small_data, tmp_path / "other")
+    for name in ("transforms_train.json", "transforms_test.json"):
+        cameras = json.loads((other / name).read_text())
+        for frame in cameras["frames"]:
+            for row in frame["transform_matrix"][:3]:
+                row[3] *= 1.1
+        (other / name).write_text(json.dumps(cameras))
+    assert eval_main([str(model), str(other)]) == 1
+    one_error(capsys, f"{other}: cameras: expected those that {model} was trained with", "sparse/")
+
+
 def test_eval_measures_lpips(
     model: Path,
     small_data: Path,

@@ -8,7 +8,7 @@ from dataclasses import asdict, replace
 from typing import Any
 
 from player.app.commands import write_result
-from player.files.files import write_bytes
+from player.files.files import check_target, write_bytes
 from player.progress import Bar, Bars
 from vfr_bake.commands.targets import check_json_target, check_page_target
 
@@ -24,16 +24,21 @@ def eval_command(options: Any) -> int:
     from vfr_bake.training.scores.evaluation import render_views
     from vfr_bake.training.scores.lpips import Lpips
     from vfr_bake.training.scores.metrics import comparison, mean_scores
+    from vfr_bake.training.scores.views import Learned, scored_views
 
+    check_json_target(options.json, [options.model])
+    if options.pictures is not None:
+        check_target(options.pictures / "0.png", force=True, is_file=True)
     lpips = None if options.lpips is None else Lpips(options.lpips)
     model = load_model(options.model, options.max_memory)
     with Bar("reading pictures") as bar:
         scene = load_scene_as(model.train, options.data, bar.count)
-    if not scene.test.cameras:
-        raise DataError(f"{options.data}: test views: expected at least 1, got none")
+    learned = Learned(str(options.model), model.cameras, model.world_from_model)
+    views, lines = scored_views(scene, options.data, model.exposure is not None, [learned])
+    for line in lines:
+        print(f"vfr-eval: {line}", file=sys.stderr)
     to_model = np.linalg.inv(model.world_from_model)
-    world = [c.transformed(scene.world_from_model) for c in scene.test.cameras]
-    views = replace(scene.test, cameras=[c.transformed(to_model) for c in world])
+    views = replace(views, cameras=[camera.transformed(to_model) for camera in views.cameras])
     names = frame_names(views.cameras)
     scores = []
     with Bar("test views") as bar:
@@ -42,7 +47,7 @@ def eval_command(options: Any) -> int:
                 picture = comparison(view.photograph, view.rgb)
                 write_png(options.pictures / f"{names[len(scores)]}.png", picture)
             scores.append(view.score(lpips))
-            bar.count(len(scores), len(world))
+            bar.count(len(scores), len(names))
     means = mean_scores(scores)
     figures = finite(means) | {
         "per_view": [finite(asdict(score)) for score in scores],
@@ -52,11 +57,13 @@ def eval_command(options: Any) -> int:
         "exposure_fitted": model.exposure is not None,
         "lpips_network": options.lpips,
     }
-    perceptual = "" if lpips is None else f", LPIPS ({lpips.network}) {means['lpips']:.4f}"
+    similar = "" if means["ssim"] is None else f", SSIM {means['ssim']:.4f}"
+    if lpips is not None and means["lpips"] is not None:
+        similar += f", LPIPS ({lpips.network}) {means['lpips']:.4f}"
     write_result(
         options.json,
         figures,
-        f"{options.model}: {means['psnr']:.2f} dB mean PSNR, SSIM {means['ssim']:.4f}{perceptual} "
+        f"{options.model}: {means['psnr']:.2f} dB mean PSNR{similar} "
         f"over {len(scores)} test views"
         + (" (exposure fitted on their left halves, right halves scored)" if model.exposure else ""),
     )
