@@ -40,6 +40,9 @@ MESHES = ("ply", "obj", "glb", "stl", "usdc", "usda")
 POINTS = 100_000
 """Points of a COLMAP model, unless another number is asked for."""
 
+MAX_POINTS = 10_000_000
+"""The most points of a cloud or a model: they take a few gigabytes of memory while they are made."""
+
 MAX_TEXTURE = 8192
 """The most texels along each side of a texture: Pillow, with which the written picture is read back, refuses
 one of twice as many."""
@@ -166,7 +169,7 @@ def _flag(key: str) -> str:
 def _check_ranges(options: ExportOptions) -> None:
     for key, low, high in (
         ("faces", 1, None),
-        ("points", 1, None),
+        ("points", 1, MAX_POINTS),
         ("lods", 2, 10),
         ("texture", 16, MAX_TEXTURE),
         ("max_gpu_mb", 1, None),

@@ -26,8 +26,9 @@ def run(name: str, command: Callable[[], int]) -> int:
     nobody reads.
 
     Errors raised on purpose (VfrError) and those that the system reports (a full disk, a name that is too
-    long, a file that may not be read) are printed as one line on stderr. Anything else is a bug and keeps its
-    traceback. An exit that the command line asks for (--help, wrong usage) goes on as SystemExit.
+    long, a file that may not be read, too little memory) are printed as one line on stderr. Anything else is
+    a bug and keeps its traceback. An exit that the command line asks for (--help, wrong usage) goes on as
+    SystemExit.
 
     The argument of a KeyboardInterrupt, if any, is printed, too: it may say what became of the work.
 
@@ -55,6 +56,11 @@ def run(name: str, command: Callable[[], int]) -> int:
         if error.errno is None:  # not from the system, but raised by a library or by this project
             raise
         _say(f"{name}: error: {printable(_described(error))}")
+        return 1
+    except MemoryError as error:
+        got = printable(str(error)) or "an error"
+        advice = "ask for less (fewer points, smaller pictures), or use a machine that has more"
+        _say(f"{name}: error: memory: expected enough of it, got: {got}: {advice}")
         return 1
     except KeyboardInterrupt as stop:
         _say(f"{name}: {'; '.join(['interrupted', *map(str, stop.args)])}")

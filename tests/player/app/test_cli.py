@@ -17,7 +17,7 @@ import pytest
 from PIL import Image
 
 from player import compiling
-from player.app import cli
+from player.app import cli, commands
 from player.files import files
 from player.render import Renderer
 from tests.player.asset.test_parts import vouch
@@ -309,6 +309,22 @@ def test_full_disk(
     assert cli.main([*views(shells_folder), "--output", str(tmp_path / "o")]) == 1
     assert "r_0.png: cannot write: No space left on device" in capsys.readouterr().err
     assert list((tmp_path / "o").iterdir()) == []
+
+
+def test_too_little_memory_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    """numpy says at once that it cannot have so much; Python's own error has no text."""
+
+    def numpy_s() -> int:
+        return len(np.empty(1 << 58, np.uint8))
+
+    def python_s() -> int:
+        raise MemoryError
+
+    for command, got in ((numpy_s, "Unable to allocate "), (python_s, "an error: ask")):
+        assert commands.run("vfr-play", command) == 1
+        printed = capsys.readouterr().err
+        assert printed.startswith(f"vfr-play: error: memory: expected enough of it, got: {got}")
+        assert printed.endswith("or use a machine that has more\n") and printed.count("\n") == 1
 
 
 def test_ctrl_c_keeps_finished_frames(
