@@ -57,6 +57,9 @@ const negated = { ...scene, grid: { ...scene.grid, features: scene.grid.features
 """JavaScript of `negated`: the scene with negated features, so that its colours differ."""
 
 
+NOT_RIGID = "c2w: expected a rotation and a translation, row by row, got ["
+
+
 @pytest.fixture(scope="module")
 def page(chromium: Browser, asset: Asset, tmp_path_factory: pytest.TempPathFactory) -> Iterator[RenderPage]:
     found = RenderPage(chromium, asset, tmp_path_factory.mktemp("calls") / "scene.html")
@@ -399,10 +402,16 @@ def test_fast_pictures_are_exact_ones_if_nothing_may_be_left_out(
     ("change", "message"),
     [
         ({"c2w": [1, 2]}, "c2w: expected 16 numbers, got [1,2]"),
+        ({"c2w": [1, 0, 0, 1e13, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]}, "c2w: expected 16 numbers, got"),
+        ({"c2w": [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 1, 2, 9, 1]}, NOT_RIGID),  # column by column
+        ({"c2w": [2, 0, 0, 1, 0, 2, 0, 2, 0, 0, 2, 9, 0, 0, 0, 1]}, NOT_RIGID),  # with a scale
+        ({"c2w": [-1, 0, 0, 1, 0, 1, 0, 2, 0, 0, 1, 9, 0, 0, 0, 1]}, NOT_RIGID),  # a mirror
+        ({"c2w": [1, 0, 0, 1, 0.002, 1, 0, 2, 0, 0, 1, 9, 0, 0, 0, 1]}, NOT_RIGID),  # a shear
         ({"fx": 0}, "fx: expected a number above 0, got 0"),
         ({"width": 2.5}, "width: expected a whole number above 0, got 2.5"),
         ({"quality": "best"}, 'quality: expected exact, high, fast, got "best"'),
-        ({"background": "red"}, 'background: expected [r, g, b] or "transparent", got "red"'),
+        ({"background": "red"}, 'background: expected [r, g, b] in 0..1 or "transparent", got "red"'),
+        ({"background": [255, 255, 255]}, "background: expected [r, g, b] in 0..1"),
         ({"width": 1 << 20}, "size: expected at most"),
     ],
 )
