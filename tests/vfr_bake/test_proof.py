@@ -35,6 +35,7 @@ def test_a_bake_asks_before_it_begins(
         model=None,
         config=SimpleNamespace(max_memory=4.0),
         force=False,
+        json=None,
         convert=None,
     )
     with pytest.raises(KeyboardInterrupt):

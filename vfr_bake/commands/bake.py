@@ -10,12 +10,14 @@ from player.app.commands import write_result
 from player.asset.target import check_asset_target
 from player.errors import ConfigError
 from player.progress import Bar, Bars
+from vfr_bake.commands.targets import check_json_target
 from vfr_bake.config import BakeConfig
 
 
 def bake_command(options: Any) -> int:
     """Bake as `options` says (`vfr_bake.options.Bake`), or convert an asset; return the exit code."""
     check_asset_target(options.asset, options.force)
+    check_json_target(options.json, [options.model], options.asset)
     if options.convert:
         return _convert(options)
     from player.proof import prove

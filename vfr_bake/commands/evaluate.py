@@ -8,9 +8,9 @@ from dataclasses import asdict, replace
 from typing import Any
 
 from player.app.commands import write_result
-from player.files.files import check_target, write_bytes
+from player.files.files import write_bytes
 from player.progress import Bar, Bars
-from vfr_bake.commands.targets import check_json_target, check_page_target
+from vfr_bake.commands.targets import check_json_target, check_page_target, check_pictures_target
 
 
 def eval_command(options: Any) -> int:
@@ -28,7 +28,7 @@ def eval_command(options: Any) -> int:
 
     check_json_target(options.json, [options.model])
     if options.pictures is not None:
-        check_target(options.pictures / "0.png", force=True, is_file=True)
+        check_pictures_target(options.pictures, options.data)
     lpips = None if options.lpips is None else Lpips(options.lpips)
     model = load_model(options.model, options.max_memory)
     with Bar("reading pictures") as bar:

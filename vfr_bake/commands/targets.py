@@ -70,6 +70,14 @@ def check_json_target(
         )
 
 
+def check_pictures_target(folder: Path, data: str) -> None:
+    """Raise OutputError if pictures cannot be written to `folder`, or if they could replace those of `data`,
+    which may have the same names."""
+    check_target(folder / "0.png", force=True, is_file=True)
+    if data != "demo" and folder.resolve().is_relative_to(Path(data).resolve()):
+        raise OutputError(f"{folder}: --pictures: expected a folder outside {data}, which is read")
+
+
 def _has_content(path: Path) -> bool:
     return path.exists() and (not path.is_file() or path.stat().st_size > 0)
 
