@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import shlex
 import sys
 import threading
 from dataclasses import replace
@@ -100,7 +101,8 @@ def _advise(asset: Path, address: str) -> None:
     if not _has_display():
         port = address.rpartition(":")[2]
         _say(f"no display here: from a machine that has one, ssh -L {port}:127.0.0.1:{port} to this")
-        _say(f"and open that address there; or render files: vfr-play {asset} --orbit 60 --output frames/")
+        name = shlex.quote(str(asset))
+        _say(f"and open that address there; or render files: vfr-play {name} --orbit 60 --output frames/")
 
 
 def _has_display() -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -100,7 +101,7 @@ def page(folder: Path, m: Manifest, known: dict[str, Any]) -> list[str]:
         ]),
     ]  # fmt: skip
     lines += _section("provenance", list(_flat(m.provenance)))
-    name = str(folder)
+    name = shlex.quote(str(folder))
     lines += _section("to look at it", [
         ("in a browser", f"vfr-play {name}"),
         ("pictures", f"vfr-play {name} --orbit 60 --output frames/"),

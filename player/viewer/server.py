@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import os
+import shlex
 import socket
 import threading
 import warnings
@@ -224,7 +225,7 @@ def _need_viser(asset: Asset) -> None:
     except ImportError as error:
         raise MissingExtraError(
             "viewer: expected the package viser, which is not installed: pip install 'vfr-bake[viewer]'; "
-            f"or render files: vfr-play {asset.folder} --orbit 60 --output frames/"
+            f"or render files: vfr-play {shlex.quote(str(asset.folder))} --orbit 60 --output frames/"
         ) from error
 
 

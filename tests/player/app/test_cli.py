@@ -7,6 +7,7 @@ import io
 import json
 import os
 import re
+import shlex
 import shutil
 import subprocess
 import sys
@@ -182,6 +183,25 @@ def test_info(shells_folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     facts = json.loads(capsys.readouterr().out)
     assert facts["bytes_total"] == sum(facts["bytes"].values()) and facts["n_channels"] == 4
     assert facts["world_units_per_model_unit"] == 2 and facts["provenance"] == {"psnr": 30.5}
+
+
+def test_commands_that_are_printed_can_be_typed(
+    shells_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The folder's name is one word of every command that is printed, also with spaces in it."""
+    folder = shutil.copytree(shells_folder, tmp_path / "my scene's bake")
+    assert cli.main([str(folder), "--info"]) == 0
+    printed = capsys.readouterr().out
+    monkeypatch.setitem(sys.modules, "viser", None)
+    assert cli.main([str(folder)]) == 1
+    printed += capsys.readouterr().err
+    monkeypatch.setattr(cli, "_has_display", lambda: False)
+    cli._advise(folder, "http://127.0.0.1:8080")
+    printed += capsys.readouterr().err
+    typed = re.findall(r"vfr-play ([/'\"].*)", printed)
+    assert [shlex.split(words)[:2] for words in typed] == [
+        [str(folder)], *[[str(folder), "--orbit"]] * 3
+    ]  # fmt: skip
 
 
 def test_check(broken_folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
