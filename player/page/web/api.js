@@ -9,7 +9,7 @@ const QUALITIES = ["exact", "high", "fast"];
 
 // Install `window.vfr`; `renderer` is a promise of the Renderer that shows the whole scene.
 export function installApi(renderer) {
-  let found = null;
+  let found = null, last = Promise.resolve(); // the end of the picture that was asked for last
   const ready = renderer.then((made) => {
     found = made;
   });
@@ -19,9 +19,11 @@ export function installApi(renderer) {
     get info() {
       return found?.info ?? null;
     },
-    async render(view) {
-      await ready;
-      return found.render(checked(view));
+    render(view) {
+      // One picture after another: all at once could take more memory than there is.
+      const picture = last.then(() => ready).then(() => found.render(checked(view)));
+      last = picture.then(() => {}, () => {});
+      return picture;
     },
   };
 }

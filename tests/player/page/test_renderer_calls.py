@@ -329,6 +329,30 @@ def test_a_picture_for_which_memory_is_short_is_refused(page: RenderPage, asset:
     assert (page.picture(camera) == before).all()
 
 
+def test_pictures_that_are_asked_for_at_once_are_rendered_one_after_another(
+    page: RenderPage, asset: Asset
+) -> None:
+    """An error of one of them changes nothing for the others."""
+    camera = scenes.cameras(asset)["outside"]
+    wanted = page.picture(camera)
+    most, pictures = page.page.evaluate(
+        """async (view) => {
+          const { gl } = renderer, { createBuffer, deleteBuffer } = gl;
+          let n = 0, most = 0;
+          gl.createBuffer = () => (most = Math.max(most, ++n), createBuffer.call(gl));
+          gl.deleteBuffer = (buffer) => (n--, deleteBuffer.call(gl, buffer));
+          const views = [view, { ...view, fx: 0 }, { ...view, width: 1 << 20 }, view, view];
+          const found = await Promise.allSettled(views.map((each) => vfr.render(each)));
+          for (const name of ["createBuffer", "deleteBuffer"]) delete gl[name];
+          return [most, found.map(({ value }) => value && [...value.rgba])];
+        }""",
+        view_of(camera),
+    )
+    assert most == 1 and [picture is None for picture in pictures] == [False, True, True, False, False]
+    for picture in pictures[::3]:
+        assert (np.reshape(picture, wanted.shape) == wanted).all()
+
+
 def test_a_picture_keeps_no_memory(page: RenderPage, asset: Asset) -> None:
     found = page.page.evaluate(
         """async (view) => {
