@@ -49,6 +49,7 @@ import math
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields
+from functools import partial
 from typing import Any
 
 from player.asset.pyramid import MAX_LEVELS
@@ -189,7 +190,10 @@ def parse_manifest(data: bytes, where: str) -> Manifest:
         raise FormatError(
             f"{where}: {ascii(unknown[0])[1:-1][:80]}: expected no such key in version {list(version)}"
         )
-    values = {key: _PARSERS[key](f"{where}: {key}", document[key]) for key in known & set(document)}
+    parsers: dict[str, Callable[[str, Any], Any]] = _PARSERS | {
+        "parts": partial(parse_parts, newer=version > VERSION)
+    }
+    values = {key: parsers[key](f"{where}: {key}", document[key]) for key in known & set(document)}
     _check_files(f"{where}: files", version, values["files"], values["parts"])
     return Manifest(**values)
 

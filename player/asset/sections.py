@@ -9,7 +9,7 @@ each can be decoded from those before it.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any, Literal
 
 from player.asset.pyramid import MAX_LEVELS
@@ -98,32 +98,37 @@ def _section_as_json(section: Section) -> dict[str, Any]:
     return {key: getattr(section, key) for key in (*_COMMON, *_OF_KIND[section.kind])}
 
 
-def parse_parts(where: str, value: object) -> tuple[Part, ...]:
+def parse_parts(where: str, value: object, newer: bool = False) -> tuple[Part, ...]:
     """Parse the manifest's `parts`, and check that each number is within its bounds. Raises FormatError.
 
-    `check_parts` checks that they agree with the rest of the manifest.
+    `newer`: whether the manifest is of a newer minor version, whose unknown keys are ignored. `check_parts`
+    checks that the parts agree with the rest of the manifest.
     """
     if isinstance(value, tuple) and all(isinstance(part, Part) for part in value):
         value = parts_as_json(value)
     if not isinstance(value, list) or len(value) > MAX_PARTS:
         raise FormatError(f"{where}: expected a list of at most {MAX_PARTS} parts, got {_show(value)}")
-    parts = tuple(_parse_part(f"{where}: {number}", number, part) for number, part in enumerate(value))
+    parts = tuple(_parse_part(f"{where}: {number}", number, part, newer) for number, part in enumerate(value))
     n_sections = sum(len(part.sections) for part in parts)
     if n_sections > MAX_SECTIONS:
         raise FormatError(f"{where}: expected at most {MAX_SECTIONS} sections, got {n_sections}")
     return parts
 
 
-def _parse_part(where: str, number: int, value: object) -> Part:
-    if not isinstance(value, dict) or set(value) != {"file", "sections"}:
+def _parse_part(where: str, number: int, value: object, newer: bool) -> Part:
+    if not isinstance(value, dict) or not _has_keys(value, {"file", "sections"}, newer):
         raise FormatError(f"{where}: expected an object with file and sections, got {_show(value)}")
     if value["file"] != part_name(number):
         raise FormatError(f"{where}: file: expected {part_name(number)}, got {_show(value['file'])}")
     sections = value["sections"]
     if not isinstance(sections, list) or not 1 <= len(sections) <= MAX_SECTIONS:
         raise FormatError(f"{where}: sections: expected a list of 1 to {MAX_SECTIONS}, got {_show(sections)}")
-    found = (_parse_section(f"{where}: section {i}", section) for i, section in enumerate(sections))
+    found = (_parse_section(f"{where}: section {i}", section, newer) for i, section in enumerate(sections))
     return Part(value["file"], tuple(found))
+
+
+def _has_keys(value: dict[str, Any], keys: set[str], newer: bool) -> bool:
+    return keys <= set(value) if newer else keys == set(value)
 
 
 _MOST = {
@@ -136,21 +141,19 @@ _MOST = {
 }
 
 
-def _parse_section(where: str, value: object) -> Section:
+def _parse_section(where: str, value: object, newer: bool) -> Section:
     if not isinstance(value, dict) or value.get("kind") not in ("structure", "symbols"):
         raise FormatError(f'{where}: expected an object of kind "structure" or "symbols", got {_show(value)}')
     keys = {*_COMMON, *_OF_KIND[value["kind"]]}
-    if set(value) != keys:
+    if not _has_keys(value, keys, newer):
         raise FormatError(f"{where}: expected the keys {sorted(keys)}, got {_show(sorted(map(str, value)))}")
     if value["grid"] not in ("densities", "features"):
         raise FormatError(f'{where}: grid: expected "densities" or "features", got {_show(value["grid"])}')
-    for key in (field.name for field in fields(Section)):
-        number = value.get(key, 0)
-        if key in _MOST and (
-            isinstance(number, bool) or not isinstance(number, int) or not 0 <= number <= _MOST[key]
-        ):
-            raise FormatError(f"{where}: {key}: expected an integer in 0..{_MOST[key]}, got {_show(number)}")
-    return Section(**value)
+    for key, most in _MOST.items():
+        number = value[key] if key in keys else 0
+        if isinstance(number, bool) or not isinstance(number, int) or not 0 <= number <= most:
+            raise FormatError(f"{where}: {key}: expected an integer in 0..{most}, got {_show(number)}")
+    return Section(**{key: value[key] for key in keys})
 
 
 def check_parts(

@@ -271,6 +271,14 @@ def test_versions(asset: Asset) -> None:
     document = json.loads(manifest_bytes(asset.manifest))
     newer = document | {"version": [4, 7], "surprise": 1}
     assert parse_manifest(json.dumps(newer).encode(), "m.json") == replace(asset.manifest, version=(4, 7))
+    newer["parts"] = [
+        part | {"more": 1, "sections": [section | {"n_rows": -1} for section in part["sections"]]}
+        for part in document["parts"]
+    ]
+    newer["files"] = {name: entry | {"more": 1} for name, entry in document["files"].items()}
+    assert parse_manifest(json.dumps(newer).encode(), "m.json") == replace(asset.manifest, version=(4, 7))
+    with pytest.raises(FormatError, match=r"parts: 0: expected an object with file and sections, got"):
+        parse_manifest(json.dumps(document | {"parts": newer["parts"]}).encode(), "m.json")
     for version, fix in (([5, 0], "install a newer vfr-bake"), ([2, 1], "bake the asset again")):
         with pytest.raises(
             VersionError, match=rf"m\.json: version: expected 3\.x or 4\.x, got {version[0]}.*{fix}"
