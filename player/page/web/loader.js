@@ -21,7 +21,7 @@
 // onProgress({ done, total }) is told the progress in bytes: half of the total is for loading and half for decoding.
 //
 // If the browser or the device cannot decode a scene, the Error that loadScene throws has `isWhole`: true, which says that
-// the data are not to blame.
+// the data are not to blame, or is a RangeError, with which a browser refuses memory.
 
 import { SceneReader, checkedFile } from "./scene_reader.js";
 
@@ -202,14 +202,14 @@ class WorkerReader {
     }).finally(() => URL.revokeObjectURL(address)).then(() => this.ask("open", manifest, grids));
   }
 
-  take({ id, result, error, isWhole }) {
+  take({ id, result, error, isWhole, isMemory }) {
     const { resolve, reject } = this.waiting.get(id);
     this.waiting.delete(id);
     if (error === undefined) {
       resolve(result);
     } else {
       this.isWhole = isWhole;
-      reject(new SceneError(error));
+      reject(Object.assign(new SceneError(error), { isWhole: isMemory }));
     }
   }
 

@@ -9,7 +9,7 @@ import { Renderer } from "./renderer.js";
 import { Viewer } from "./viewer.js";
 
 const INSTEAD = "Open this page in a current Chrome, Edge, Firefox or Safari, with hardware acceleration switched on "
-  + "in its settings, or on a device with more graphics memory.";
+  + "in its settings, or on a device with more memory, or ask for the scene baked with --preset phone.";
 const ANEW = "What arrived is not whole: load the page again, or ask for it anew.";
 const RESET = "The graphics card was reset. If the picture does not come back by itself, "
   + "load the page again.";
@@ -47,7 +47,7 @@ async function show() {
       panel.connect(viewer, new Controls(viewer), scene.cameras);
     }
   } catch (error) {
-    if (error.isWhole) advice = INSTEAD;
+    if (error.isWhole || error instanceof RangeError) advice = INSTEAD;
     if (viewer) problem = `This scene cannot be shown whole here: ${error.message}. ${advice}`;
     else panel.fail(`This scene cannot be shown here: ${error.message}. ${advice}`);
     throw error;

@@ -312,6 +312,21 @@ def test_a_scene_that_takes_too_much_memory_to_decode_asks_for_another_device(
         assert "MB of memory: expected at most 3200 MB" in check_advises_another_device(found)
 
 
+@pytest.mark.parametrize("where", ["worker.js", "loader.js"])
+def test_a_device_that_refuses_memory_is_not_told_that_the_data_are_broken(
+    chromium: Browser, asset: Asset, where: str
+) -> None:
+    """Memory is refused to the worker that decodes, and to the page, which then decodes without one."""
+    answers = site(asset)
+    refuse = b"DataView = class { constructor() { throw RangeError('Array buffer allocation failed'); } };\n"
+    if where == "loader.js":
+        refuse += b"globalThis.Worker = undefined;\n"
+    body, type_ = answers[SITE + where]
+    answers[SITE + where] = (refuse + body, type_)
+    with opened(chromium, SITE, answers) as found:
+        assert "Array buffer allocation failed" in check_advises_another_device(found)
+
+
 def test_a_page_that_was_cut_short_says_so(chromium: Browser, asset: Asset, tmp_path: Path) -> None:
     whole, path = page(asset), tmp_path / "cut.html"
     for share in (0.9, 0.6):
