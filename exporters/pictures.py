@@ -6,7 +6,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from exporters.formats.exr import exr_channels, exr_header, load_openexr, write_exr
+from exporters.formats.parity import COARSEST
+from exporters.surface.marching_cubes import voxel_size
 from player.asset.asset import Asset
 from player.cameras.camera import Camera
 from player.errors import ConfigError
@@ -25,6 +29,9 @@ def export_pictures(
     progress: Progress = silent,
 ) -> dict[str, Any]:
     """Render each camera with the asset's own number of feature lookups per ray, and write `target/NAME.exr`.
+
+    If the world is so far from its origin that steps of float32 are over COARSEST of a voxel, the layer
+    `position` and OpenEXR's own matrices are left out.
 
     Args:
         asset: an open asset.
@@ -47,13 +54,21 @@ def export_pictures(
         raise ConfigError("--views: expected at least one view, got none")
     for camera in cameras:
         check_size(camera.width, camera.height)
+    places = _float32_holds_places(asset, cameras)
     n_bytes, written = 0, []
     with new_folder(target, force) as folder, Renderer(asset) as renderer:
         for done, (camera, name) in enumerate(zip(cameras, names, strict=True), start=1):
             frame = renderer.render(camera, background="transparent", layers=True)
-            channels = exr_channels(frame, camera, half)
+            channels = exr_channels(frame, camera, half, places)
             path = folder / f"{name}.exr"
-            write_exr(path, channels, exr_header(camera))
+            write_exr(path, channels, exr_header(camera, places))
             n_bytes, written = n_bytes + path.stat().st_size, list(channels)
             progress(done, len(cameras))
     return {"pictures": len(cameras), "channels": written, "bytes": n_bytes}
+
+
+def _float32_holds_places(asset: Asset, cameras: Sequence[Camera]) -> bool:
+    """Return whether float32 is fine enough for places of the scene and of the cameras (world frame)."""
+    middles = [asset.world_from_model[:3, 3], *(camera.c2w[:3, 3] for camera in cameras)]
+    step = float(np.spacing(np.float32(np.abs(middles).max())))
+    return step <= COARSEST * voxel_size(asset.grid) * asset.scale

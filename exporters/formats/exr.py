@@ -50,13 +50,16 @@ SOFTWARE = "vfr-export"
 _HEADER_BYTES = 1 << 16  # more than the attributes of a picture written here take
 
 
-def exr_channels(frame: Frame, camera: Camera, half: bool = False) -> dict[str, np.ndarray]:
+def exr_channels(
+    frame: Frame, camera: Camera, half: bool = False, places: bool = True
+) -> dict[str, np.ndarray]:
     """Return the channels of a rendered frame, by name.
 
     Args:
         frame: rendered over no background ("transparent") and with `layers`.
         camera: the camera that the frame was rendered with, WORLD frame.
         half: 16 bits for the channels that hold colours, directions and features.
+        places: whether float32 is fine enough for places in the world; if not, there is no `position`.
 
     Returns:
         name: [h, w] float16 or float32.
@@ -77,7 +80,7 @@ def exr_channels(frame: Frame, camera: Camera, half: bool = False) -> dict[str, 
         ("", "A", frame.opacity, kind),
         ("", "Z", np.where(met, distance * cosines, np.inf), np.float32),
         ("distance.", "V", np.where(met, distance, np.inf), np.float32),
-        ("position.", "XYZ", np.where(met[..., None], position, 0), np.float32),
+        *([("position.", "XYZ", np.where(met[..., None], position, 0), np.float32)] if places else []),
         ("normal.", "XYZ", np.where(met[..., None], frame.normals, 0), kind),
         ("opacity.", "V", frame.opacity, kind),
         ("samples.", "V", frame.n_density_samples, np.float32),
@@ -91,12 +94,13 @@ def exr_channels(frame: Frame, camera: Camera, half: bool = False) -> dict[str, 
     return channels
 
 
-def exr_header(camera: Camera) -> dict[str, Any]:
+def exr_header(camera: Camera, places: bool = True) -> dict[str, Any]:
     """Return the attributes of a picture: the meaning of its numbers, and its camera.
 
     `worldToCamera` and `worldToNDC` are OpenEXR's own, for ROW vectors (p' = p M); the camera's axes are x
     right, y up, -z ahead. `vfr.cameraToWorld` is the c2w of transforms.json, for column vectors, and
-    `vfr.intrinsics` the 3 x 3 matrix of fx, fy, cx, cy in pixels, pixel centres at +0.5.
+    `vfr.intrinsics` the 3 x 3 matrix of fx, fy, cx, cy in pixels, pixel centres at +0.5. OpenEXR's own are in
+    float32: without `places` (see `exr_channels`) they are left out.
 
     >>> header = exr_header(Camera("a", np.eye(4), 4, 2, 3.0, 3.0, 2.0, 1.0))
     >>> bool(np.allclose(np.array([0, 0, -5.0, 1]) @ header["worldToNDC"], [2.5, 2.5, 1, 5]))
@@ -111,11 +115,14 @@ def exr_header(camera: Camera) -> dict[str, Any]:
             [0, 0, -1, 0],
         ]
     )
+    matrices = {
+        "worldToCamera": np.ascontiguousarray(w2c.T, np.float32),
+        "worldToNDC": np.ascontiguousarray((ndc_from_camera @ w2c).T, np.float32),
+    }
     return {
         "chromaticities": REC709,
         "software": SOFTWARE,
-        "worldToCamera": np.ascontiguousarray(w2c.T, np.float32),
-        "worldToNDC": np.ascontiguousarray((ndc_from_camera @ w2c).T, np.float32),
+        **(matrices if places else {}),
         "vfr.camera": camera.name,
         "vfr.cameraToWorld": np.ascontiguousarray(camera.c2w, np.float64),
         "vfr.intrinsics": np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]]),

@@ -31,7 +31,8 @@ OBJ; none for GLB's float32."""
 LINEAR_TOLERANCE = 6e-8
 """Largest difference of linear light: half a quantization step in float32."""
 COARSEST = 0.1
-"""Largest step of float32 between two coordinates that is allowed, in median edges of the mesh."""
+"""Largest step of float32 between two coordinates that is allowed, in median edges of the mesh, or in voxels
+for pictures."""
 
 
 def check_steps(mesh: TriangleMesh, where: str, hint: str) -> None:

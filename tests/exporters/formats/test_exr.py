@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import shutil
 import sys
 from pathlib import Path
 
@@ -140,6 +142,24 @@ def test_cameras_of_a_file(shells_asset: Path, tmp_path: Path) -> None:
     arguments = [str(shells_asset), str(target), "--format", "exr", "--views", "4", "--size", "9x7"]
     assert cli.main([*arguments, "--cameras", str(given)]) == 0
     assert [path.name for path in target.iterdir()] == ["r_4.exr"]
+
+
+def test_no_places_where_float32_cannot_hold_them(shells_asset: Path, tmp_path: Path) -> None:
+    """In the coordinates of a map, pictures have the same layers but `position`, and no float32 matrix."""
+    asset = shutil.copytree(shells_asset, tmp_path / "far")
+    manifest = json.loads((asset / "manifest.json").read_text())
+    cameras = json.loads((asset / "cameras.json").read_text())
+    for matrix in [manifest["world_from_model"], *(each["transform_matrix"] for each in cameras["frames"])]:
+        matrix[0][3] += 4.5e6
+    (asset / "manifest.json").write_text(json.dumps(manifest))
+    (tmp_path / "far.json").write_text(json.dumps(cameras))
+    more = ["--format", "exr", "--views", "1", "--size", "24x20", "--cameras"]
+    assert cli.main([str(asset), str(tmp_path / "a"), *more, str(tmp_path / "far.json")]) == 0
+    with OpenEXR.File(str(tmp_path / "a" / "r_1.exr"), separate_channels=True) as file:
+        assert sorted(file.channels()) == sorted(name for name in LAYERS if not name.startswith("position"))
+        header = dict(file.header())
+    assert not {"worldToCamera", "worldToNDC"} & set(header)
+    assert header["vfr.cameraToWorld"][0, 3] == cameras["frames"][1]["transform_matrix"][0][3]
 
 
 @pytest.mark.parametrize(
