@@ -4,7 +4,7 @@ An asset is a folder of regular files. It holds no absolute path and plays where
 
 | file | content |
 |---|---|
-| `manifest.json` | the keys below; UTF-8, keys sorted, each once; at most 16 MiB and 2^20 values |
+| `manifest.json` | the keys below; UTF-8, keys sorted, each once; at most 16 MiB, 2^20 values, 64 deep |
 | `part_0.bin`, `part_1.bin`, ... | densities and features; the first is a whole, coarse picture |
 | `head.onnx` | the graph of `player.head.graph`: `features`, `dirs` -> `rgb`; no other graph is taken |
 | `mesh.ply` | the surface with vertex colours, world frame |
@@ -75,6 +75,8 @@ FILES_OF_3 = (
 """The files that every asset of version 3 has."""
 MAX_BYTES = 16 << 20
 MAX_VALUES = 1 << 20
+MAX_DEPTH = 64
+"""The most lists and objects inside one another: what walks through them by recursion has room for these."""
 MAX_RESOLUTION = 2048
 MAX_STEPS = 65536
 MAX_LEVEL_STEP = 128
@@ -175,6 +177,10 @@ def parse_manifest(data: bytes, where: str) -> Manifest:
         )
     except (ValueError, RecursionError) as error:
         raise FormatError(f"{where}: expected JSON, got something else: {error}") from error
+    if _is_deeper(document, MAX_DEPTH):
+        raise FormatError(
+            f"{where}: expected at most {MAX_DEPTH} lists and objects inside one another, got more"
+        )
     if not isinstance(document, dict) or document.get("format") != FORMAT:
         raise FormatError(f'{where}: format: expected "{FORMAT}", got {_show(document)}')
     version = _parse_version(f"{where}: version", document.get("version"))
@@ -248,6 +254,14 @@ def manifest_bytes(manifest: Manifest) -> bytes:
         return (json.dumps(document, sort_keys=True, indent=1, allow_nan=False) + "\n").encode()
     except (ValueError, TypeError) as error:
         raise FormatError(f"manifest: provenance: expected finite JSON values: {error}") from error
+
+
+def _is_deeper(value: object, most: int) -> bool:
+    """Return whether more than `most` lists and objects are inside one another."""
+    if not isinstance(value, dict | list):
+        return False
+    inside = value.values() if isinstance(value, dict) else value
+    return most == 0 or any(_is_deeper(item, most - 1) for item in inside)
 
 
 def _refuse(text: str) -> float:

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from player.asset.manifest import Manifest
+from player.asset.asset import Asset
+from player.asset.manifest import Manifest, manifest_bytes, parse_manifest
 from player.errors import FormatError
 from tests.player.asset.test_asset import SMALLEST
 
@@ -36,6 +37,23 @@ def test_numbers_are_accepted_up_to_their_limits(key: str) -> None:
     for value in (below, above):
         with pytest.raises(FormatError, match=f"{key}: expected"):
             replace(SMALLEST, **{key: value})
+
+
+@pytest.mark.parametrize("one", [("[", "]"), ('{"a":', "}")])
+def test_lists_and_objects_may_be_nested_up_to_a_limit(one: tuple[str, str], asset: Asset) -> None:
+    """The manifest and its `provenance` are two of them. The reader of JSON would take thousands, which those
+    that show them have no stack for."""
+
+    def parsed(n: int) -> Manifest:
+        nested = one[0] * n + "1" + one[1] * n
+        text = manifest_bytes(asset.manifest).decode().replace("30.5", nested)
+        return parse_manifest(text.encode(), "m.json")
+
+    assert parsed(62).provenance
+    with pytest.raises(
+        FormatError, match=r"m\.json: expected at most 64 lists and objects inside one another"
+    ):
+        parsed(63)
 
 
 def rotation(random: np.random.Generator) -> np.ndarray:
