@@ -4,8 +4,8 @@ instant-ngp and nerfstudio, or a COLMAP model, `sparse/0/cameras.bin`, `images.b
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from pathlib import Path
+from collections.abc import Callable, Sequence
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
@@ -56,26 +56,61 @@ def load_transforms_folder(
     folder: Path, progress: Progress | None = None, reader: PictureReader | None = None
 ) -> Capture:
     """Load the pictures of `folder` with their cameras from `transforms_train.json` and
-    `transforms_test.json`, or from one `transforms.json`.
+    `transforms_test.json`, or from one `transforms.json`, split as its lists say if it has any (`_listed`).
 
     Raises DataError (pictures) or FormatError (JSON, cameras), in one line that names the file.
     """
     train_file, test_file = folder / "transforms_train.json", folder / "transforms_test.json"
     if not train_file.exists():
         train_file = folder / "transforms.json"
-    described = _described_views(train_file)
-    n_train = len(described)
-    has_test = train_file.name == "transforms_train.json" and test_file.exists()
-    if has_test:
-        described += _described_views(test_file)
+    reader = reader or PictureReader()
+    document = load_transforms(train_file)
+    train = _described_views(document, train_file, reader.say)
+    if train_file.name == "transforms_train.json" and test_file.exists():
+        test = _described_views(load_transforms(test_file), test_file, reader.say)
+    else:
+        train, test = _listed(document, train_file, train)
+    n_train, described = len(train), [*train, *test]
     if n_train < 2:
         raise DataError(f"{train_file}: training views: expected at least 2, got {n_train}")
-    views = (reader or PictureReader()).read(described, progress)
-    n_views = len(described)
-    train, test = (
-        (views.some(range(n_train)), views.some(range(n_train, n_views))) if has_test else held_out(views)
+    views = reader.read(described, progress)
+    if not test:
+        return _capture(folder, described, *held_out(views))
+    return _capture(folder, described, views.some(range(n_train)), views.some(range(n_train, len(described))))
+
+
+def _listed(
+    document: dict[str, Any], path: Path, views: list[DescribedView]
+) -> tuple[list[DescribedView], list[DescribedView]]:
+    """Split the views of a transforms file as nerfstudio does, by its lists of `file_path`. Returns the views
+    to train on, and those to test with.
+
+    Test views are those in `test_filenames`, or in `val_filenames` if no test view is listed. Training views
+    are those in `train_filenames`, or all that are in neither of the other lists; a test view is never one of
+    them. Views that are left over are not used. Raises FormatError.
+    """
+    names = {_plain_name(view.camera.name) for view in views}
+    lists: dict[str, set[str]] = {}
+    for key in ("train_filenames", "val_filenames", "test_filenames"):
+        listed = document.get(key, [])
+        if not isinstance(listed, list) or not all(isinstance(name, str) for name in listed):
+            raise FormatError(f"{path}: {key}: expected a list of file paths, got {brief(listed)}")
+        lists[key] = {_plain_name(name) for name in listed}
+        if unknown := sorted(lists[key] - names):
+            raise FormatError(
+                f"{path}: {key}: expected the file_path of a frame, got {brief(unknown[0])}: add the "
+                "frame, or remove the name from the list"
+            )
+    test = lists["test_filenames"] or lists["val_filenames"]
+    train = lists["train_filenames"] or names - lists["val_filenames"]
+    return (
+        [view for view in views if _plain_name(view.camera.name) in train - test],
+        [view for view in views if _plain_name(view.camera.name) in test],
     )
-    return _capture(folder, described, train, test)
+
+
+def _plain_name(file_path: str) -> str:
+    return PurePosixPath(file_path.replace("\\", "/")).as_posix()
 
 
 def _capture(
@@ -95,10 +130,11 @@ def has_transforms(folder: Path) -> bool:
     return any((folder / name).exists() for name in ("transforms_train.json", "transforms.json"))
 
 
-def _described_views(path: Path) -> list[DescribedView]:
-    """Return the views of a transforms file. Errors in the file are found before the first picture is
-    decoded."""
-    document = load_transforms(path)
+def _described_views(
+    document: dict[str, Any], path: Path, say: Callable[[str], object]
+) -> list[DescribedView]:
+    """Return the views of a transforms file, each once. Errors in the file are found before the first picture
+    is decoded. `say`: called with a sentence if frames are repeated."""
     frames: list[dict[str, Any]] = document["frames"]
     paths = [_picture_path(path, index, frame) for index, frame in enumerate(frames)]
     layouts = [_layout(picture) for picture in paths]
@@ -109,7 +145,43 @@ def _described_views(path: Path) -> list[DescribedView]:
     cameras = transforms_cameras(document, path, sizes)
     distortions = [_distortion(document, path, index) for index in range(len(frames))]
     masks = [_mask(path, index, frames[index], picture) for index, picture in enumerate(paths)]
-    return [DescribedView(*view) for view in zip(paths, cameras, distortions, upright, masks, strict=True)]
+    for index, (picture, camera, size) in enumerate(zip(paths, cameras, sizes, strict=True)):
+        _check_shape(f"{path}: frame {index} ({frames[index]['file_path']})", picture, camera, size)
+    views = [DescribedView(*view) for view in zip(paths, cameras, distortions, upright, masks, strict=True)]
+    return _each_once(path, views, say)
+
+
+def _each_once(path: Path, views: list[DescribedView], say: Callable[[str], object]) -> list[DescribedView]:
+    """Return the views without those that are there already: a view that is there twice would be both learned
+    from and held out. Raises DataError: a picture has two different cameras."""
+    known: dict[Path, DescribedView] = {}
+    kept = []
+    for index, view in enumerate(views):
+        first = known.setdefault(view.path.resolve(), view)
+        if first is view:
+            kept.append(view)
+        elif not np.allclose(first.camera.c2w, view.camera.c2w):
+            raise DataError(
+                f"{path}: frame {index} ({view.camera.name}): expected one camera for each picture, got "
+                "another one in an earlier frame: remove the wrong frame"
+            )
+    if len(kept) < len(views):
+        n_again = len(views) - len(kept)
+        say(f"{path.name}: {n_again} of {len(views)} frames repeat earlier ones, and are left out")
+    return kept
+
+
+def _check_shape(where: str, picture: Path, camera: Camera, size: tuple[int, int]) -> None:
+    """Raise DataError unless a picture of `size` (width, height) has the shape that its camera has. Sizes of
+    pictures that were made smaller may have been rounded by a pixel or two."""
+    scale = max(size) / max(camera.width, camera.height)
+    off = max(abs(size[0] - scale * camera.width), abs(size[1] - scale * camera.height))
+    if off > max(2.0, 0.01 * min(size)):
+        raise DataError(
+            f"{where}: size: expected a picture of the shape of its camera, {camera.width}x{camera.height}, "
+            f"got {size[0]}x{size[1]} in {picture.name}: take the picture that belongs to the camera, "
+            "neither cropped nor turned, or give the camera of this picture"
+        )
 
 
 def _layout(picture: Path) -> PictureHeader:
@@ -134,10 +206,11 @@ def _mask(path: Path, index: int, frame: dict[str, Any], picture: Path) -> Path 
     root = path.parent
     named = frame.get("mask_path")
     if named is not None:
-        if not isinstance(named, str) or not _is_file(root / named):
-            where = f"{path}: frame {index} ({frame['file_path']})"
-            raise DataError(f"{where}: mask_path: expected a picture, got {brief(named)}")
-        return root / named
+        for form in (named, named.replace("\\", "/")) if isinstance(named, str) else ():
+            if _is_file(root / form):
+                return root / form
+        where = f"{path}: frame {index} ({frame['file_path']})"
+        raise DataError(f"{where}: mask_path: expected a picture, got {brief(named)}")
     inside = picture.relative_to(root).as_posix() if picture.is_relative_to(root) else picture.name
     return mask_of(root, inside)
 
@@ -195,15 +268,12 @@ def load_colmap_folder(
         size = (lens.width, lens.height)
         camera = Camera(image.name, image.c2w, *size, lens.fx, lens.fy, lens.cx, lens.cy)
         picture = _colmap_picture(folder, image.name)
-        described.append(
-            DescribedView(
-                picture,
-                camera,
-                lens.distortion,
-                upright or is_taken_upright(_layout(picture), size),
-                mask_of(folder, image.name),
-            )
-        )
+        layout = _layout(picture)
+        turned = upright or is_taken_upright(layout, size)
+        shape = layout.upright_size if turned else layout.size
+        _check_shape(f"{model}: {image.name}", picture, camera, shape)
+        mask = mask_of(folder, image.name)
+        described.append(DescribedView(picture, camera, lens.distortion, turned, mask))
     train, test = held_out((reader or PictureReader()).read(described, progress))
     return _capture(folder, described, train, test, points)
 

@@ -80,6 +80,12 @@ def test_pictures_that_were_made_smaller_keep_their_view(tmp_path: Path) -> None
     assert (camera.width, camera.fx, camera.cx) == (SIZE, 30.0, 12.0)
 
 
+def test_pictures_of_another_shape_are_refused(folder: Path) -> None:
+    Image.new("RGB", (2 * SIZE, SIZE)).save(folder / "images/003.png")
+    with pytest.raises(DataError, match=r"003\.png: size: expected a picture of the shape of its"):
+        load_folder(folder)
+
+
 def test_the_real_capture(can: Path) -> None:
     scene = load_scene(can, downscale=4)
     assert (len(scene.train.cameras), len(scene.test.cameras)) == (62, 9)

@@ -17,9 +17,11 @@ from player.cameras.camera import Camera
 from player.cameras.transforms import read_cameras
 from player.errors import DataError, FormatError, MissingExtraError
 from vfr_bake.data import load_scene
+from vfr_bake.data.capture import PosedImages
 from vfr_bake.data.demo import demo_cameras
 from vfr_bake.data.files.opening import SUFFIXES
 from vfr_bake.data.files.pictures import read_picture, undistort
+from vfr_bake.data.store.reading import PictureReader
 
 
 def picture(seed: int, width: int = 8, height: int = 6, channels: int = 4) -> np.ndarray:
@@ -75,6 +77,65 @@ def test_every_eighth_view_is_held_out(tmp_path: Path):
     np.testing.assert_array_equal(scene.test.images[1], picture(8))
 
 
+def names(views: PosedImages) -> str:
+    return " ".join(camera.name.removeprefix("./r_") for camera in views.cameras)
+
+
+@pytest.mark.parametrize(
+    ("train", "val", "test", "expected"),
+    [
+        ("0 1 2 3 4 5", "6 7", "8 9", ("0 1 2 3 4 5", "8 9")),
+        ("0 1 2 3 4 5", "6 7", "", ("0 1 2 3 4 5", "6 7")),
+        ("0 1 2", "8 9", "8 9", ("0 1 2", "8 9")),
+        ("", "6 7", "8 9", ("0 1 2 3 4 5", "8 9")),
+        ("", "", "8 9", ("0 1 2 3 4 5 6 7", "8 9")),
+        ("0 1 2 3 8", "", "8 9", ("0 1 2 3", "8 9")),
+        ("1 2 3 4 5 6 7 8 9", "", "", ("2 3 4 5 6 7 8", "1 9")),
+    ],
+)
+def test_lists_of_nerfstudio_split_the_views(
+    tmp_path: Path, train: str, val: str, test: str, expected: tuple[str, str]
+):
+    """Views are split by `train_filenames` and so on, whose paths may be written in another form. A test view
+    is never trained on."""
+    splits = {"train": train, "val": val, "test": test}
+    top = {f"{split}_filenames": [f"r_{k}" for k in of.split()] for split, of in splits.items() if of}
+    scene = load_scene(make_folder(tmp_path / "a", 10, **top))
+    assert (names(scene.train), names(scene.test)) == expected
+    np.testing.assert_array_equal(scene.test.images[0], picture(int(expected[1][0])))
+
+
+def test_broken_lists_of_nerfstudio_are_named(tmp_path: Path):
+    unknown = message(make_folder(tmp_path / "a", 4, test_filenames=["r_1", "r_9"]), FormatError)
+    assert "transforms.json: test_filenames: expected the file_path of a frame, got r_9" in unknown
+    for broken in ("r_1", [1], {"r_1": 2}):
+        text = message(make_folder(tmp_path / "a", 4, val_filenames=broken), FormatError)
+        assert "transforms.json: val_filenames: expected a list of file paths, got " in text
+    everything = message(make_folder(tmp_path / "a", 4, test_filenames=[f"r_{k}" for k in range(4)]))
+    assert "training views: expected at least 2, got 0" in everything
+
+
+def test_a_frame_that_is_there_twice_is_taken_once(tmp_path: Path):
+    """A repeated frame is left out, or it would be both held out and trained on."""
+    folder = make_folder(tmp_path / "a", 9)
+
+    def repeat(document: Any) -> None:
+        frames = document["frames"]
+        document["frames"] = [*frames, {**frames[0], "file_path": "r_0.png"}, frames[8]]
+
+    edit(folder / "transforms.json", repeat)
+    said: list[str] = []
+    scene = load_scene(folder, reader=PictureReader(say=said.append))
+    assert (names(scene.train), names(scene.test)) == ("1 2 3 4 5 6 7", "0 8")
+    assert said[0] == "transforms.json: 2 of 11 frames repeat earlier ones, and are left out"
+
+
+def test_a_picture_with_two_cameras_is_refused(tmp_path: Path):
+    folder = make_folder(tmp_path / "a", 4)
+    edit(folder / "transforms.json", lambda d: d["frames"][3].update(file_path="r_1.png"))
+    assert "frame 3 (r_1.png): expected one camera for each picture, got another one" in message(folder)
+
+
 def test_few_views_are_all_trained_on(tmp_path: Path):
     scene = load_scene(make_folder(tmp_path / "a", 7))
     assert len(scene.train.cameras) == 7 and scene.test.images == []
@@ -113,6 +174,30 @@ def test_pictures_of_another_size_than_the_file_says(tmp_path: Path):
     camera = load_scene(folder).train.cameras[0]
     assert (camera.width, camera.height) == (8, 6)
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == (10, 9, 4.5, 2.5)
+
+
+@pytest.mark.parametrize("size", [(12, 16), (12, 12), (100, 50), (400, 290)])
+def test_a_picture_of_another_shape_than_its_camera_is_refused(tmp_path: Path, size: tuple[int, int]):
+    """Pictures that were turned or cropped do not fit their cameras: rays would be wrong without a word."""
+    width, height = (100 * side for side in size)
+    folder = make_folder(tmp_path / "a", 3, w=width, h=height, fl_x=20.0)
+    for index in range(3):
+        Image.fromarray(picture(index, 160, 120)).save(folder / f"r_{index}.png")
+    text = message(folder)
+    assert f"frame 0 (./r_0): size: expected a picture of the shape of its camera, {width}x{height}" in text
+    assert "got 160x120 in r_0.png" in text
+
+
+@pytest.mark.parametrize("size", [(1297, 840), (840, 1297), (30, 17)])
+@pytest.mark.parametrize("factor", [2, 3, 4, 8])
+def test_a_picture_that_was_made_smaller_may_be_rounded(
+    tmp_path: Path, size: tuple[int, int], factor: int
+) -> None:
+    folder = make_folder(tmp_path / "a", 2, w=size[0], h=size[1], fl_x=20.0)
+    rounded = (size[0] // factor, -(-size[1] // factor))
+    for index in range(2):
+        Image.fromarray(picture(index, *rounded)).save(folder / f"r_{index}.png")
+    assert load_scene(folder).train.cameras[0].width == rounded[0]
 
 
 def test_suffixes_and_separators(tmp_path: Path):

@@ -73,7 +73,8 @@ class PictureReader:
         """The working size; after `read`, the one that was used."""
         self._model, self._on_disk, self._kept = model, on_disk, kept
         self._may_shrink = may_shrink
-        self._say = say or (lambda text: None)
+        self.say = say or (lambda text: None)
+        """Called with a sentence on what was chosen or found."""
 
     def read(self, described: Sequence[DescribedView], progress: Progress | None) -> PosedImages:
         """Read the pictures, with the pinhole cameras that would have taken them.
@@ -133,7 +134,7 @@ class PictureReader:
     def _tell(self, sizes: Sequence[tuple[int, int]], where: str) -> None:
         targets = [self.size.size(*size) for size in sizes]
         smaller = "" if targets == list(sizes) else f", reduced to {_named(targets)}"
-        self._say(f"{len(sizes)} pictures of {_named(sizes)}{smaller}{where}")
+        self.say(f"{len(sizes)} pictures of {_named(sizes)}{smaller}{where}")
 
     def _threads(self, described: Sequence[DescribedView], sizes: Sequence[tuple[int, int]]) -> int:
         return n_threads(max(map(self.size.reading_bytes, described, sizes), default=1))
@@ -159,7 +160,7 @@ class PictureReader:
         side = int(longest * math.sqrt(free / needed)) // STEP * STEP
         if not self._may_shrink or side < LEAST_SIDE:
             raise OutputError(_no_room(root, needed, free))
-        self._say(
+        self.say(
             f"{root}: {needed / 1e9:.1f} GB for pictures of {longest} pixels, {free / 1e9:.1f} GB are free: "
             f"the longest side is {side} instead; free some room for more"
         )

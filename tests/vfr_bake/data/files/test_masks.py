@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -54,6 +55,25 @@ def test_what_is_masked_is_not_drawn(tmp_path: Path) -> None:
     trainer = Trainer(scene, TrainConfig(device="cpu", batch_rays=64))
     assert (trainer.witnesses.rgba[:, 3] == 255).all() and len(trainer.witnesses.pixels) > 100
     assert (trainer._draw(500).rgba[:, 3] == 1).all()
+
+
+@pytest.mark.parametrize("separator", ["/", "\\"])
+def test_a_frame_may_name_its_mask(tmp_path: Path, separator: str) -> None:
+    """A frame names its mask by nerfstudio's `mask_path`, which a program on Windows writes with backslashes,
+    as it does `file_path`."""
+    folder = masked_folder(tmp_path)
+    (folder / "masks").rename(folder / "hidden")
+    document = json.loads((folder / "transforms.json").read_text())
+    document["frames"][1]["mask_path"] = f"hidden{separator}01.png"
+    (folder / "transforms.json").write_text(json.dumps(document))
+    scene = load_scene(folder, kind="unbounded")
+    assert [bool((image[:, :16, 3] == 0).all()) for image in scene.train.images[:2]] == [True, False]
+    document["frames"][1]["mask_path"] = f"hidden{separator}none.png"
+    (folder / "transforms.json").write_text(json.dumps(document))
+    with pytest.raises(
+        DataError, match=r"frame 1 \(images/01\.png\): mask_path: expected a picture, got hidden"
+    ):
+        load_scene(folder)
 
 
 def test_a_masked_scene_is_none_with_an_object(tmp_path: Path) -> None:
