@@ -426,11 +426,12 @@ class BenchConfig:
     """Timed frames of each setting and size."""
     minutes: float = 10
     """Minutes of the whole measurement, roughly: on a slow machine fewer frames are timed, at least two of
-    each setting and size."""
+    each setting and size, and fewer test views are compared, at least one."""
     threads: int | None = None
     """Threads of the player; one for each core if not given."""
     max_memory: float | None = None
-    """Gigabytes of memory that each asset may take when it is opened; half of the machine's if not given."""
+    """Gigabytes of memory that each asset, and the model, may take when it is opened; half of the machine's
+    if not given."""
 
     def check(self) -> None:
         """Check the settings; raises ConfigError for what cannot be measured."""

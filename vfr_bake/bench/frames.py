@@ -1,7 +1,7 @@
 """Processes that render for the bench: one plays an asset, another renders the full model.
 
     python -m vfr_bake.bench.frames player ASSET CAMERAS THREADS MAX_MEMORY
-    python -m vfr_bake.bench.frames model MODEL CAMERAS THREADS
+    python -m vfr_bake.bench.frames model MODEL CAMERAS THREADS MAX_MEMORY
 
 A request has `view`, `size` [width, height], for an asset `samples` and `quality`, and `rgb`: a file for the
 picture [height, width, 4], its colours over the background and its opacity, or null. The answer has the
@@ -59,23 +59,24 @@ def open_player(folder: str, cameras: str, threads: str, max_memory: str) -> Ans
     return answer
 
 
-def open_model(path: str, cameras: str, threads: str) -> Answer:
-    """Open a model and return a function that renders it; `threads` 0 is one for each core."""
+def open_model(path: str, cameras: str, threads: str, max_memory: str) -> Answer:
+    """Open a model and return a function that renders it; `threads` and `max_memory` are those of
+    `open_player`."""
     import numba
     import torch
 
-    from vfr_bake.rendering.render import render_rays
+    from vfr_bake.rendering.render import render_camera
     from vfr_bake.training.model_file import load_model
 
     if int(threads):
         torch.set_num_threads(int(threads))
         numba.set_num_threads(min(int(threads), numba.get_num_threads()))
-    model = load_model(Path(path))
+    model = load_model(Path(path), float(max_memory) or None)
     views = [c.transformed(np.linalg.inv(model.world_from_model)) for c in read_cameras(Path(cameras))]
 
     def answer(request: dict[str, Any]) -> dict[str, Any]:
         camera = views[request["view"]].resized(*request["size"])
-        (colours, opacity), ms = _timed(lambda: render_rays(model.field, model.sampler, *camera.rays()))
+        (colours, opacity), ms = _timed(lambda: render_camera(model.field, model.sampler, camera))
         rgb = colours + (1 - opacity[:, None]) * model.background
         size = camera.height, camera.width
         return _kept(request, rgb.reshape(*size, 3), opacity.reshape(size)) | {

@@ -31,6 +31,7 @@ def trade_page(trade: Trade) -> bytes:
         f"{width}x{height}; {trade.conditions['frames_a_setting_and_size']} frames a setting and size, in "
         f"turns; {trade.conditions['threads']} threads, {escape(trade.conditions['march'])}. {fitted}"
         "Filled marks and bold rows are on the front: no other setting is better, faster and smaller.</p>",
+        *(f"<p>{escape(note)}</p>" for note in trade.conditions["notes"]),
         "<h2>Quality against time</h2><p>Size of a mark: megabytes.</p>",
         plot(_marks(trade, "time"), f"ms a frame at {width}x{height}", "PSNR, dB"),
         "<h2>Quality against size</h2><p>Size of a mark: ms a frame.</p>",

@@ -1,9 +1,10 @@
 """Measurement of every setting of some assets: quality against the photographs and the full
 model, time, bytes and memory.
 
-The full model renders first, in a process that ends before anything is timed. Then one process per asset
-plays it: first all pictures, for quality, then frames in turns with the other processes, for time
-(`vfr_bake.bench.timing`).
+After the assets' first pictures the full model renders, in a process that ends before frames are timed. Then
+one process per asset plays it: first all pictures, for quality, then frames in turns with the other
+processes, for time (`vfr_bake.bench.timing`). If there is no time for the model's pictures, or for those of
+the assets, fewer views are compared.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ import shlex
 import tempfile
 import time
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +21,8 @@ import numpy as np
 
 from player.asset.asset import Asset
 from player.cameras.camera import Camera
-from player.cameras.transforms import write_cameras
-from player.errors import ConfigError, DataError
+from player.cameras.transforms import read_cameras, write_cameras
+from player.errors import ConfigError
 from player.march.interpolation import Quality
 from player.progress import Report
 from player.threads import bounded_threads
@@ -33,13 +34,17 @@ from vfr_bake.bench.timing import Dials, Size, frame_times, measure_times
 from vfr_bake.bench.worst import WorstPixel, worst_pixels
 from vfr_bake.config import BenchConfig
 from vfr_bake.data import load_scene_as
-from vfr_bake.training.scores.evaluation import RenderedView, beside_photograph
+from vfr_bake.training.model_file import load_model
+from vfr_bake.training.scores.evaluation import RenderedView, beside_photograph, evenly
 from vfr_bake.training.scores.metrics import Distance, mean, mean_scores, psnr, ssim
+from vfr_bake.training.scores.views import Learned, scored_views, spread_order
 
 N_FIRST_PICTURES = 3
 """Number of times that an asset is opened to time its first picture; the median counts."""
 MODEL_FRAMES = 3
 """Frames of the full model at each size except the photographs' own, at which every view is rendered."""
+SHARE = 1 / 3
+"""Share of the minutes that the full model may take, and that the pictures for quality may take."""
 
 
 @dataclass(frozen=True)
@@ -58,6 +63,10 @@ class Views:
     """True if the model was trained with an exposure for each picture. The exposure of a view is then fitted
     on its left half, and the right half is scored, as `vfr-eval` does."""
 
+    def first(self, n_views: int) -> Views:
+        """Return the first views."""
+        return replace(self, cameras=self.cameras[:n_views], photographs=self.photographs[:n_views])
+
     def beside(self, pictures: list[np.ndarray]) -> list[RenderedView]:
         """Return the pictures [h, w, 4], one per view with colours over the background and opacity, in the
         form in which they are compared with the photographs."""
@@ -73,22 +82,35 @@ def measure_trade(config: BenchConfig, lpips: Distance | None, progress: Report)
     """Play the assets with every k and quality at every size, and return what was measured; `progress` is
     called with (stage, done, of).
 
-    Raises ConfigError, DataError or FormatError: an asset, the model or the data cannot be used, or they are
-    not of one scene.
+    Raises ConfigError, DataError or FormatError: an asset, the model or the data cannot be used, or cameras
+    of equal name in them differ, so that they are not of one scene.
     """
-    begin = time.monotonic()
+    begin, most_seconds = time.monotonic(), 60 * SHARE * config.minutes
     assets = {  # opened whole, because figures of a part would be reported as those of the asset
         str(folder): Asset.open(folder, verify=True, max_memory=config.max_memory) for folder in config.assets
     }
-    views = _read_views(config, list(assets.values()), progress)
+    views, notes = _read_views(config, list(assets.values()), progress)
+    n_views = len(views.cameras)
     own = views.cameras[0].width, views.cameras[0].height
     half_and_twice = [((own[0] + 1) // 2, (own[1] + 1) // 2), (2 * own[0], 2 * own[1])]
     sizes = list(dict.fromkeys([own, *(config.frame_sizes() or half_and_twice)]))
     dials = _all_dials(config, list(assets.values()))
     with tempfile.TemporaryDirectory(prefix="vfr-bench-") as folder, ExitStack() as stack:
         run = _Run(Path(folder), views, config, lpips, progress)
-        model, full = (None, None) if config.model is None else run.model(config.model, sizes, config.data)
-        first = run.first_pictures(list(assets), own)
+        first, frame_seconds = run.first_pictures(list(assets), own)
+        scored = len(assets) * (1 if config.model is None else 2)
+        seconds_a_view = len(dials) * (frame_seconds + scored * run.score_seconds())
+        run.views = views.first(max(1, int(min(n_views, most_seconds / seconds_a_view))))
+        model, full = None, None
+        if config.model is not None:
+            model, full, scaled = run.model(config.model, sizes, config.data, most_seconds)
+            notes += scaled
+        views = run.views
+        if len(views.cameras) < n_views:
+            notes.append(
+                f"compared {len(views.cameras)} of {n_views} test views, because there is no time for more "
+                f"in {config.minutes:g} minutes: for more, raise --minutes, or give --samples"
+            )
         players = [stack.enter_context(run.player(name)) for name in assets]
         qualities = [
             run.quality(name, asset, player, dials, full)
@@ -133,6 +155,7 @@ def measure_trade(config: BenchConfig, lpips: Distance | None, progress: Report)
         "background": views.background.tolist(),
         "bits": 8,
         "exposure_fitted": views.exposure,
+        "notes": notes,
     }
     pictures = [quality.worst_view for quality in qualities]
     worst = {quality.worst_view.name: quality.worst for quality in qualities}
@@ -158,7 +181,7 @@ class _Run:
     def __init__(
         self, folder: Path, views: Views, config: BenchConfig, lpips: Distance | None, progress: Report
     ) -> None:
-        self._views = views
+        self.views = views
         self._lpips = lpips
         self._progress = progress
         self._picture = folder / "picture.npy"
@@ -170,53 +193,80 @@ class _Run:
     def player(self, name: str) -> Process:
         return Process("player", name, str(self._cameras), self._threads, self._max_memory)
 
-    def model(self, path: Path, sizes: list[Size], data: str) -> tuple[Setting, list[np.ndarray]]:
-        """Return the full model's row and its pictures, one per view."""
-        n_views = len(self._views.cameras)
-        own = [(camera.width, camera.height) for camera in self._views.cameras]
-        frames = [(sizes[0], view) for view in range(n_views)]
-        frames += [(size, turn % n_views) for size in sizes[1:] for turn in range(MODEL_FRAMES)]
-        answers: dict[Size, list[dict[str, Any]]] = {size: [] for size in sizes}
-        pictures = []
-        with Process("model", str(path), str(self._cameras), self._threads) as process:
+    def model(
+        self, path: Path, sizes: list[Size], data: str, most_seconds: float
+    ) -> tuple[Setting, list[np.ndarray], list[str]]:
+        """Return the full model's row, its pictures, one per view, and lines about what there was no time
+        for. Only as many views as can be rendered within `most_seconds` are kept, but at least one, and sizes
+        that would take longer get times that are scaled by the number of pixels."""
+        n_views = len(self.views.cameras)
+        pictures, own, lines = [], [], []
+        with Process("model", str(path), str(self._cameras), self._threads, self._max_memory) as process:
             process.ask(view=0, size=[32, 32], rgb=None)
-            for done, (size, view) in enumerate(frames, start=1):
-                compared = done <= n_views
-                kept = str(self._picture) if compared else None
-                answers[size].append(process.ask(view=view, size=own[view] if compared else size, rgb=kept))
-                if kept is not None:
-                    pictures.append(np.load(kept))
-                self._progress("full model", done, len(frames))
+            begin = time.monotonic()
+            for view, camera in enumerate(self.views.cameras):
+                size = camera.width, camera.height
+                own.append(process.ask(view=view, size=size, rgb=str(self._picture)))
+                pictures.append(np.load(self._picture))
+                self._progress("full model", len(own), n_views)
+                if (time.monotonic() - begin) * (len(own) + 1) / len(own) > most_seconds:
+                    break
+            self.views = self.views.first(len(own))
+            answers = {sizes[0]: own}
+            for size in sizes[1:]:
+                larger = size[0] * size[1] / (sizes[0][0] * sizes[0][1])
+                expected = MODEL_FRAMES * larger * own[0]["ms"] / 1000
+                if time.monotonic() - begin + expected <= most_seconds:
+                    turns = [turn % len(own) for turn in range(MODEL_FRAMES)]
+                    answers[size] = [process.ask(view=view, size=size, rgb=None) for view in turns]
+                else:
+                    answers[size] = [answer | {"ms": larger * answer["ms"]} for answer in own]
+                    lines.append(
+                        f"there was no time to render the full model at {size[0]}x{size[1]}: its "
+                        f"milliseconds are those at {sizes[0][0]}x{sizes[0][1]}, scaled by the pixels"
+                    )
         setting = Setting(
             name=str(path),
             asset=None,
             n_fetches=None,
             quality=None,
             what={"preset": "full model"},
-            scores=self.scores(self._views.beside(pictures), pictures, None),
+            scores=self.scores(self.views.beside(pictures), pictures, None),
             times={size: frame_times(some, None, [1.0] * len(some)) for size, some in answers.items()},
             n_bytes=path.stat().st_size,
             peak_mb=answers[sizes[0]][-1]["peak_mb"],
             first_picture_ms=None,
             commands=(shlex.join(["vfr-eval", str(path), data]),),
         )
-        return setting, pictures
+        return setting, pictures, lines
 
-    def first_pictures(self, names: list[str], size: Size) -> list[float]:
-        """Return for each asset the milliseconds from starting a process to its first
-        picture; the assets take turns."""
+    def score_seconds(self) -> float:
+        """Return the seconds that the scores of one picture take."""
+        one = self.views.first(1)
+        height, width = one.photographs[0].shape[:2]
+        for _ in range(2):  # the first time, packages are imported
+            start = time.perf_counter()
+            for view in one.beside([np.zeros((height, width, 4), np.float32)]):
+                view.score(self._lpips)
+        return time.perf_counter() - start
+
+    def first_pictures(self, names: list[str], size: Size) -> tuple[list[float], float]:
+        """Return for each asset the milliseconds from starting a process to its first picture, and the
+        seconds that a later one of all assets takes, with a lookup at every sample; the assets take turns."""
         request = {"view": 0, "size": size, "rgb": None, **Dials(1).request()}
         with self.player(names[0]) as process:  # compiles the code, if that has not been done before
             process.ask(**request)
         taken: list[list[float]] = [[] for _ in names]
+        later = {}
         for turn in range(N_FIRST_PICTURES):
             for name, milliseconds in zip(names, taken, strict=True):
                 start = time.perf_counter()
                 with self.player(name) as process:
                     process.ask(**request)
                     milliseconds.append(1000 * (time.perf_counter() - start))
+                    later[name] = process.ask(**request | Dials(0).request())["ms"]
             self._progress("first pictures", turn + 1, N_FIRST_PICTURES)
-        return [float(np.median(milliseconds)) for milliseconds in taken]
+        return [float(np.median(milliseconds)) for milliseconds in taken], sum(later.values()) / 1000
 
     def quality(
         self, name: str, asset: Asset, player: Process, dials: list[Dials], full: list[np.ndarray] | None
@@ -224,24 +274,24 @@ class _Run:
         """Score every view with all dials against the photographs, and against the model's pictures
         `full` if there are any."""
         scores: dict[Dials, dict[str, float | None]] = {}
-        first = self._views.photographs[0][..., :3] / np.float32(255)
+        first = self.views.photographs[0][..., :3] / np.float32(255)
         worst_view, worst, peak = Pictures(name, first, first), [], None
         for done, some in enumerate(dials):
             pictures = []
-            for view, photograph in enumerate(self._views.photographs):
+            for view, photograph in enumerate(self.views.photographs):
                 height, width = photograph.shape[:2]
                 request = {"view": view, "size": [width, height], "rgb": str(self._picture)}
                 answer = player.ask(**request, **some.request())
                 pictures.append(np.load(self._picture))
                 peak = answer["peak_mb"]
-            beside = self._views.beside(pictures)
+            beside = self.views.beside(pictures)
             scores[some] = self.scores(beside, pictures, full)
             if some == Dials(asset.manifest.n_fetches):
                 wanted = [view.photograph for view in beside] if full is None else _colours(full)
                 shown = [view.rgb for view in beside] if full is None else _colours(pictures)
                 lowest = int(np.argmin([psnr(a, b) for a, b in zip(wanted, shown, strict=True)]))
                 worst_view = Pictures(name, wanted[lowest], shown[lowest])
-                worst = worst_pixels(asset, self._views.cameras, wanted, shown)
+                worst = worst_pixels(asset, self.views.cameras, wanted, shown)
             self._progress(f"quality of {name}", done + 1, len(dials))
         return _Quality(scores, peak, worst_view, worst)
 
@@ -290,21 +340,29 @@ def played_bytes(asset: Asset) -> int:
     return sum(entry.bytes for name, entry in files if not name.startswith("report."))
 
 
-def _read_views(config: BenchConfig, assets: list[Asset], progress: Report) -> Views:
+def _read_views(config: BenchConfig, assets: list[Asset], progress: Report) -> tuple[Views, list[str]]:
+    """Return the views to compare, in an order of which every beginning is spread evenly, and lines to
+    print."""
     train = assets[0].manifest.provenance.get("train", {})
     scene = load_scene_as(train, config.data, lambda done, of: progress("reading pictures", done, of))
-    if not scene.test.cameras:
-        raise DataError(f"{config.data}: test views: expected at least 1, got none")
-    n_views = min(config.views, len(scene.test.cameras))
-    chosen = np.linspace(0, len(scene.test.cameras) - 1, n_views).round().astype(int)
-    cameras = [scene.test.cameras[i].transformed(scene.world_from_model) for i in chosen]
+    exposure = any(_exposure_learned(asset.manifest.provenance) for asset in assets)
+    learned = [
+        Learned(str(asset.folder), read_cameras(asset.path("cameras.json")), asset.world_from_model)
+        for asset in assets
+    ]
+    if config.model is not None:
+        model = load_model(config.model, config.max_memory)
+        learned.append(Learned(str(config.model), model.cameras, model.world_from_model))
+    views, lines = scored_views(scene, config.data, exposure, learned)
+    some = evenly(len(views.cameras), config.views)
+    chosen = some[spread_order(len(some))]
     backgrounds = {asset.manifest.background for asset in assets}
     if len(backgrounds) > 1:
         raise ConfigError(f"assets: expected one background, got {sorted(backgrounds)}")
     background = np.array(backgrounds.pop(), np.float32)
-    photographs = [scene.test.images[i] for i in chosen]
-    exposure = any(_exposure_learned(asset.manifest.provenance) for asset in assets)
-    return Views(cameras, background, photographs, scene.masked, exposure)
+    photographs = [views.images[int(i)] for i in chosen]
+    cameras = [views.cameras[i] for i in chosen]
+    return Views(cameras, background, photographs, scene.masked, exposure), lines
 
 
 def _exposure_learned(provenance: dict[str, Any]) -> bool:

@@ -83,6 +83,8 @@ def bench_command(options: Any) -> int:
     lpips = None if options.lpips is None else Lpips(options.lpips)
     with Bars() as bars:
         trade = measure_trade(options, lpips, bars.count)
+    for note in trade.conditions["notes"]:
+        print(f"vfr-bench: {note}", file=sys.stderr)
     if (timed := trade.conditions["frames_a_setting_and_size"]) < options.frames:
         print(
             f"vfr-bench: timed {timed} of {options.frames} frames of each setting and size in "

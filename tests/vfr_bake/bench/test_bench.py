@@ -27,13 +27,13 @@ from vfr_bake.bench.front import Point, beats, pareto_front, recommend
 from vfr_bake.bench.process import Process
 from vfr_bake.bench.result import MAX_PSNR
 from vfr_bake.bench.timing import Dials, Times, lookup_slope, measure_times
-from vfr_bake.bench.trade import Views, _read_views
+from vfr_bake.bench.trade import Views, _read_views, _Run
 from vfr_bake.bench.worst import APART, worst_pixels
 from vfr_bake.cli import bench_main
 from vfr_bake.config import BakeConfig, BenchConfig, FieldConfig
 from vfr_bake.field.field import VfrField
 from vfr_bake.rendering.occupancy import OccupancyGrid
-from vfr_bake.training.model_file import Model, save_model
+from vfr_bake.training.model_file import Model, load_model, save_model
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +43,7 @@ def data(shells_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     asset = Asset.open(shells_folder)
     cameras = read_cameras(asset.path("cameras.json"))
     for split, some in (("train", cameras[:3]), ("test", cameras[3:])):
-        named = [replace(camera, name=f"./{split}/r_{i}") for i, camera in enumerate(some)]
+        named = [replace(camera, name=f"./{split}/photo_{i}") for i, camera in enumerate(some)]
         (folder / split).mkdir()
         for camera in named:
             frame = render(asset, camera, n_fetches=0, march="numba")
@@ -210,6 +210,81 @@ def test_a_player_that_fails_says_why(shells_folder: Path, tmp_path: Path) -> No
         process.ask(view=0, size=[8, 8], rgb=None, **Dials(1).request())
 
 
+def test_a_model_of_another_world_is_refused(
+    model: Path, data: Path, shells_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A camera of the data has the name of one of the model's, and another pose."""
+    other = load_model(model)
+    camera = other.cameras[0].transformed(np.diag([2.0, 2, 2, 1]))
+    save_model(tmp_path / "m.pt", replace(other, cameras=[replace(camera, name="./train/photo_0")]))
+    arguments = [str(shells_folder), "--data", str(data), "--model", str(tmp_path / "m.pt"), *QUICK]
+    assert bench_main(arguments) == 1
+    said = capsys.readouterr().err.splitlines()[-1]
+    assert said.startswith(f"vfr-bench: error: {data}: cameras: expected those that {tmp_path / 'm.pt'} was")
+
+
+def test_a_model_is_read_within_the_memory(model: Path, shells_folder: Path) -> None:
+    with (
+        Process("model", str(model), str(shells_folder / "cameras.json"), "1", "1e-6") as process,
+        pytest.raises(Exception, match=r"model\.pt: .*memory"),
+    ):
+        process.ask(view=0, size=[8, 8], rgb=None)
+
+
+@pytest.mark.parametrize(
+    ("seconds", "n_views", "halves", "twice"), [(0, 1, 1, 1), (25, 2, 2, 2), (58, 5, 3, 5), (1e9, 5, 3, 3)]
+)
+def test_the_full_model_keeps_to_its_seconds(
+    seconds: float, n_views: int, halves: int, twice: int, model: Path, tmp_path: Path, monkeypatch
+) -> None:
+    """A picture takes 10 s here, three at half the size 7.5 s and three at twice the size 120 s. Where there
+    is no time, there are fewer views, and times of other sizes are scaled."""
+    now, size = [0.0], (48, 40)
+
+    class Slow:
+        def __init__(self, *arguments: str) -> None:
+            assert arguments == ("model", str(model), str(tmp_path / "cameras.json"), "1", "3")
+
+        def __enter__(self) -> Slow:
+            return self
+
+        def __exit__(self, *_: object) -> None:
+            pass
+
+        def ask(self, view: int, size: tuple[int, int], rgb: str | None) -> dict:
+            taken = 10 * size[0] * size[1] / (48 * 40) if tuple(size) != (32, 32) else 0.0
+            now[0] += taken
+            if rgb is not None:
+                np.save(rgb, np.ones((size[1], size[0], 4), np.float32))
+            return {"ms": 1000 * taken, "march_ms": 0.0, "head_ms": 0.0, "fetches": 0, "peak_mb": 1.0}
+
+    monkeypatch.setattr("vfr_bake.bench.trade.time.monotonic", lambda: now[0])
+    monkeypatch.setattr("vfr_bake.bench.trade.Process", Slow)
+    config = BenchConfig(assets=(), data="", threads=1, max_memory=3)
+    cameras = [Camera(f"{i}", np.eye(4), *size, 40.0, 40.0, 24.0, 20.0) for i in range(5)]
+    photographs = [np.full((40, 48, 4), 128, np.uint8)] * 5
+    run = _Run(tmp_path, Views(cameras, np.ones(3), photographs, False, False), config, None, lambda *_: None)
+    sizes = [size, (24, 20), (96, 80)]
+    setting, pictures, lines = run.model(model, sizes, "data", seconds)
+    assert len(pictures) == n_views and run.views.cameras == cameras[:n_views]
+    assert [setting.times[some].frames for some in sizes] == [n_views, halves, twice]
+    assert [setting.times[some].median for some in sizes] == [10_000, 2_500, 40_000]
+    assert len(lines) == (halves != 3) + (twice != 3)
+    assert all(line.startswith("there was no time to render the full model at ") for line in lines)
+
+
+def test_fewer_views_are_compared_where_there_is_no_time(
+    shells_folder: Path, data: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("vfr_bake.bench.trade.N_FIRST_PICTURES", 1)
+    arguments = [str(shells_folder), "--data", str(data), "--samples", "1", *QUICK, "--minutes", "1e-9"]
+    assert bench_main([*arguments, "--json", "-"]) == 0
+    said = capsys.readouterr()
+    conditions = json.loads(said.out)["conditions"]
+    assert len(conditions["views"]) == 1 and len(conditions["notes"]) == 1
+    assert re.search(r"vfr-bench: compared 1 of \d test views, because there is no time for more ", said.err)
+
+
 # --- the front ---
 
 
@@ -371,7 +446,7 @@ def test_exposure_is_fitted_on_left_halves_where_training_learned_it(
     asset = Asset.open(shells_folder)
     trained = {"trained": {"effects": {"exposure": exposure}}}
     asset = replace(asset, manifest=replace(asset.manifest, provenance=trained))
-    views = _read_views(BenchConfig(assets=(shells_folder,), data=str(data)), [asset], lambda *_: None)
+    views, _ = _read_views(BenchConfig(assets=(shells_folder,), data=str(data)), [asset], lambda *_: None)
     assert views.exposure is exposure and not views.masked
     pictures, photographs = [], []
     for camera in views.cameras:
@@ -406,6 +481,5 @@ def test_what_training_never_wrote_is_no_exposure(
 ) -> None:
     asset = Asset.open(shells_folder)
     asset = replace(asset, manifest=replace(asset.manifest, provenance={"trained": remembered}))
-    assert not _read_views(
-        BenchConfig(assets=(shells_folder,), data=str(data)), [asset], lambda *_: None
-    ).exposure
+    config = BenchConfig(assets=(shells_folder,), data=str(data))
+    assert not _read_views(config, [asset], lambda *_: None)[0].exposure
