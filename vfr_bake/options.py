@@ -16,7 +16,8 @@ from vfr_bake.config import BakeConfig, BenchConfig, TrainConfig
 class Train:
     """Train a Volume Feature Rendering field on photographs.
 
-    The model file holds everything that vfr-bake needs. Ctrl-C ends training early and keeps the model.
+    The model file holds everything that vfr-bake needs. Ctrl-C ends training early and keeps the model, and a
+    checkpoint beside it from which --resume goes on.
 
     examples:
       vfr-train photos/ model.pt                  estimate the cameras, and train for at most 12 minutes
@@ -44,7 +45,8 @@ class Train:
     """Do not keep the pictures, reduced and decoded, for the next run with them (docs/train.md), and remove
     them if they are kept."""
     resume: bool = False
-    """Go on from the checkpoint that an interrupted run left beside the model file; without one, begin."""
+    """Go on from the checkpoint that an interrupted run left beside the model file, and replace the model of
+    that run; without a checkpoint, begin."""
     preview: bool = False
     """Every minute, write a view that is not learned from beside its photograph, and where they differ, to
     MODEL.preview.png (model.preview.png for model.pt): a second or two each time."""

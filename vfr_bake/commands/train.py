@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from player.app.commands import write_result
-from player.errors import MissingExtraError, VfrError
+from player.errors import MissingExtraError, OutputError, VfrError
 from player.files.files import check_target, write_bytes
 from player.progress import Bar, Bars
 from player.terminal import printable
@@ -42,7 +42,6 @@ def train_command(options: Any) -> int:
     code."""
     from vfr_bake.data import load_scene, training_reader
     from vfr_bake.training.checkpoint import checkpoint_path, load_checkpoint
-    from vfr_bake.training.model_file import save_model, trained_model
     from vfr_bake.training.processes import Processes
     from vfr_bake.training.trainer import Trainer
 
@@ -51,10 +50,14 @@ def train_command(options: Any) -> int:
     if options.model is None:
         print("vfr-train: expected a model file to write, or --check; see vfr-train --help", file=sys.stderr)
         return 2
-    check_model_target(options.model, options.force)
+    checkpoint = checkpoint_path(options.model)
+    goes_on = options.resume and checkpoint.exists()
+    check_model_target(options.model, options.force or goes_on)
     check_json_target(options.json, [], options.model)
     config = options.config
     processes = Processes.from_environment()
+    if options.resume and not goes_on and processes.first:
+        print(f"vfr-train: {checkpoint}: no such checkpoint: training begins anew", file=sys.stderr)
     # The pictures of a ZIP or a video can be looked at only once they are unpacked.
     packed = not Path(options.data).is_dir()
     glance = _glance(options.data, config) if processes.first and not packed else None
@@ -74,34 +77,63 @@ def train_command(options: Any) -> int:
     if processes.first:
         _warn_of_folds(scene)
     trainer = Trainer(scene, config, processes)
-    checkpoint = checkpoint_path(options.model)
-    if options.resume and checkpoint.exists():
+    if goes_on:
         load_checkpoint(checkpoint, trainer)
         if processes.first:
             print(f"vfr-train: going on after step {trainer.next_step}", file=sys.stderr)
     preview = _preview(options, scene) if options.preview and processes.first else None
     figures = _train_steps(trainer, checkpoint, preview)
-    interrupted = figures.pop("interrupted")
     figures["blurred"] = blurred
-    witnesses = trainer.witness_psnr() if processes.first and not interrupted else None
+    stopped = figures.pop("interrupted")
+    if processes.first:
+        stopped = _finish(options, trainer, scene, figures, stopped)
+    processes.leave()
+    return 130 if stopped else 0
+
+
+def _finish(options: Any, trainer: Trainer, scene: Scene, figures: dict[str, Any], interrupted: bool) -> bool:
+    """Write the model, measure it, and report; return whether Ctrl-C was pressed, in training or here.
+
+    Ctrl-C during the measurements ends them: the model is complete, and is reported without them. An
+    `interrupted` training is not measured, and leaves a checkpoint.
+    """
+    from vfr_bake.training.checkpoint import checkpoint_path
+    from vfr_bake.training.model_file import save_model, trained_model
+
+    checkpoint, config = checkpoint_path(options.model), trainer.config
+    stopped, witnesses = interrupted, None
+    if not stopped:
+        try:
+            witnesses = trainer.witness_psnr()
+        except KeyboardInterrupt:
+            stopped = True
     if witnesses is not None:
         figures["witness_psnr"] = {"patches": witnesses.patches, "whole": witnesses.whole}
-    if processes.first:
-        model = trained_model(trainer, scene, figures)
-        save_model(options.model, model)
-        n_views, most_seconds = config.eval_views, math.inf
-        if n_views is None:
-            n_views = EVAL_VIEWS[scene.unbounded]
-            most_seconds = max(EVAL_SHARE * figures["seconds"], LEAST_EVAL_SECONDS)
-        if not interrupted and n_views and scene.test.cameras:
+    model = trained_model(trainer, scene, figures)
+    save_model(options.model, model)
+    n_views, most_seconds = config.eval_views, math.inf
+    if n_views is None:
+        n_views = EVAL_VIEWS[scene.unbounded]
+        most_seconds = max(EVAL_SHARE * figures["seconds"], LEAST_EVAL_SECONDS)
+    if not stopped and n_views and scene.test.cameras:
+        try:
             figures |= _test_figures(model, scene, n_views, most_seconds)
+        except KeyboardInterrupt:
+            stopped = True
+        else:
             save_model(options.model, replace(model, figures=figures))
+    if interrupted:
+        if not (why := _unsaved(checkpoint, trainer)):
+            why = f"interrupted: the same command with --resume goes on; {checkpoint} is kept for it"
+        print(f"vfr-train: {printable(why)}", file=sys.stderr)
+    else:
         checkpoint.unlink(missing_ok=True)
-        for line in [*trainer.effects.described(), *(witnesses.lines() if witnesses else ())]:
-            print(f"vfr-train: {line}", file=sys.stderr)
-        _report_training(options, figures, interrupted)
-    processes.leave()
-    return 130 if interrupted else 0
+        if stopped:
+            print("vfr-train: interrupted: the model is complete, but not measured", file=sys.stderr)
+    for line in [*trainer.effects.described(), *(witnesses.lines() if witnesses else ())]:
+        print(f"vfr-train: {line}", file=sys.stderr)
+    _report_training(options, figures, interrupted)
+    return stopped
 
 
 def _check(options: Any) -> int:
@@ -224,12 +256,11 @@ def _preview(options: Any, scene: Scene) -> Preview:
 
 def _train_steps(trainer: Trainer, checkpoint: Path, preview: Preview | None) -> dict[str, Any]:
     """Train to the end or to Ctrl-C, with a checkpoint now and then; return the figures to report."""
-    from vfr_bake.training.checkpoint import save_checkpoint
     from vfr_bake.training.length.expectation import EXPECTED_AT, TIMED_FROM, typical_step
     from vfr_bake.training.scores.metrics import decibels
 
     last = None
-    interrupted = False
+    interrupted = told = False
     ends: list[float] = []
     saved = time.monotonic()
     with Bar("training", trainer.processes.first) as bar:
@@ -255,7 +286,11 @@ def _train_steps(trainer: Trainer, checkpoint: Path, preview: Preview | None) ->
                     preview.update(trainer)
                 due = time.monotonic() - saved > 60 * trainer.config.checkpoint_minutes
                 if due and trainer.processes.first:
-                    save_checkpoint(checkpoint, trainer)
+                    why = _unsaved(checkpoint, trainer)
+                    if why and not told:
+                        bar.close()
+                        print(f"vfr-train: {printable(why)}: training goes on without it", file=sys.stderr)
+                        told = True
                     saved = time.monotonic()
         except KeyboardInterrupt:
             interrupted = True
@@ -272,6 +307,18 @@ def _train_steps(trainer: Trainer, checkpoint: Path, preview: Preview | None) ->
         "training_psnr": round(decibels(error), 3) if error else None,
         "interrupted": interrupted,
     }
+
+
+def _unsaved(checkpoint: Path, trainer: Trainer) -> str:
+    """Write a checkpoint; return why it cannot be written, or nothing. The training in memory is worth more
+    than its checkpoint, so a full disk does not end it."""
+    from vfr_bake.training.checkpoint import save_checkpoint
+
+    try:
+        save_checkpoint(checkpoint, trainer)
+    except OutputError as error:
+        return str(error)
+    return ""
 
 
 def _expect(trainer: Trainer, seconds_a_step: float, bar: Bar) -> None:
