@@ -8,9 +8,9 @@ import sys
 from dataclasses import fields
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
-from exporters.options import FOLDERS, FORMATS, POINTS, ExportOptions
+from exporters.options import FOLDERS, FORMATS, POINTS, Coordinates, ExportOptions, Method
 from player.app.commands import run
 from player.app.option_types import gigabytes, joined_negatives, number, part, size, whole
 from player.app.options import MAX_MEMORY
@@ -114,7 +114,7 @@ def make_parser() -> argparse.ArgumentParser:
     add("asset", type=Path, metavar="ASSET", help="folder that `vfr-bake` wrote")
     add("file", type=Path, metavar="FILE", help="file or folder to write: " + ", ".join(FORMATS) + ", DIR/")
     _value(parser, "--format", "NAME", "exr, colmap or web for a folder; or a suffix without its dot")
-    add("--frame", choices=("world", "model", "gltf", "blender"), help="coordinates (world); see below")
+    add("--frame", choices=get_args(Coordinates), help="coordinates (world); see below")
     add("--force", action="store_true", help="replace FILE if it exists")
     _value(parser, "--max-memory", "GB", MAX_MEMORY, type=gigabytes)
     add("--json", action="store_true", help="print the summary as one line of JSON")
@@ -138,8 +138,9 @@ def _add_shapes(group: argparse._ArgumentGroup) -> None:
     faces, lods, texels, cloud = (whole(example=n) for n in (100000, 3, 2048, 200000))
     value("--faces", "N", "simplify the mesh to N faces, or as few as can be reached", type=faces)
     value("--lods", "N", "levels of detail: N files, each of half the faces of the last", type=lods)
-    methods = ("baked", "density", "tsdf")
-    add("--method", choices=methods, help="the baked mesh; marching cubes in all voxels; fused depth")
+    add(
+        "--method", choices=get_args(Method), help="the baked mesh; marching cubes in all voxels; fused depth"
+    )
     density, seconds = number("a density", "12.5"), number("seconds", "300")
     value("--level", "X", "density of the surface, 1/model unit (half opaque: two voxels)", type=density)
     value("--texture", "N", "obj, glb: colours in a picture of N x N (needs xatlas)", type=texels)

@@ -14,11 +14,14 @@ mesh that it is given, and a Z-up program that opens the file turns it back.
 
 from __future__ import annotations
 
+from typing import get_args
+
 import numpy as np
 
+from exporters.options import Coordinates
 from player.errors import ConfigError
 
-COORDINATES = ("world", "model", "gltf", "blender")
+COORDINATES = get_args(Coordinates)
 
 Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 """[4, 4] matrix of (x, y, z) -> (x, z, -y), a quarter turn about x."""

@@ -20,6 +20,7 @@ from exporters.shapes.colour import linear_from_srgb
 from exporters.shapes.mesh import TriangleMesh
 from exporters.shapes.texture import Texture
 from exporters.shapes.volume import Volume
+from player.asset.bricks import keys_of
 from player.errors import ConfigError, ParityError
 
 COLOUR_TOLERANCE = {".ply": 0.0, ".obj": 6e-5, ".glb": 8e-6, ".usdc": 6e-8, ".usda": 6e-8}
@@ -139,15 +140,10 @@ def check_volume_bytes(suffix: str, data: bytes, volume: Volume, where: str) -> 
 
 def _check_grid(where: str, what: str, expected: VdbGrid, got: VdbGrid, tolerance: float) -> None:
     """Raise ParityError unless two grids agree, in whichever order their vertices are."""
-    order, rows = _sorted(expected.index), _sorted(got.index)
+    order, rows = (np.argsort(keys_of(grid.index), kind="stable") for grid in (expected, got))
     _check_rows(where, "matrix", expected.matrix, got.matrix, 0.0)
     _check_rows(where, "vertices", expected.index[order], got.index[rows], 0.0)
     _check_rows(where, what, expected.values[order], got.values[rows], tolerance)
-
-
-def _sorted(index: np.ndarray) -> np.ndarray:
-    x, y, z = index.T.astype(np.int64)
-    return np.argsort((x << 40) | (y << 20) | z, kind="stable")
 
 
 def _rounding(mesh: TriangleMesh) -> float:

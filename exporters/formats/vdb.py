@@ -25,7 +25,7 @@ import numpy as np
 
 from exporters.shapes.colour import linear_from_srgb
 from exporters.shapes.volume import Volume
-from player.asset.bricks import pack_vertices, stored_bits
+from player.asset.bricks import pack_vertices, unpack_vertices
 from player.errors import ConfigError, FormatError
 
 _MAGIC, _VERSION, _LIBRARY = 0x56444220, 224, (6, 2)
@@ -242,8 +242,7 @@ def _read_grid(file: _Reader, width: int) -> VdbGrid:
             raise ValueError(f"a leaf at byte {file.at} with another mask")
         file.at += len(head)
         values.append(file.array("<f4", int(np.bitwise_count(mask).sum()) * width))
-    leaf, bit = np.nonzero(stored_bits(stored))
-    index = np.concatenate(origins)[leaf] * 8 + np.stack([bit >> 6, (bit >> 3) & 7, bit & 7], axis=-1)
+    index = unpack_vertices(np.concatenate(origins), stored)
     return VdbGrid(index, np.concatenate(values).reshape(-1, width), matrix)
 
 
