@@ -7,8 +7,9 @@ unit length, so `t` is a distance in scene units.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -28,7 +29,7 @@ class Camera:
     name: str
     """The picture's path as the data set writes it, for example `./test/r_0`."""
     c2w: np.ndarray
-    """[4, 4] float64, camera to world, rigid."""
+    """[4, 4] float64, camera to world, rigid: a copy of what was given, and read-only."""
     width: int
     height: int
     fx: float
@@ -37,6 +38,14 @@ class Camera:
     cy: float
 
     def __post_init__(self) -> None:
+        for key, (convert, expected) in _CONVERSIONS.items():
+            value = getattr(self, key)
+            try:
+                converted = convert(value)
+            except (TypeError, ValueError, OverflowError):
+                got = " ".join(repr(value).split())[:80]
+                raise FormatError(f"{self.name}: {key}: expected {expected}, got {got}") from None
+            object.__setattr__(self, key, converted)
         check_pose(self.c2w, self.name)
         if self.width < 1 or self.height < 1:
             raise FormatError(f"{self.name}: size: expected at least 1x1, got {self.width}x{self.height}")
@@ -105,6 +114,27 @@ class Camera:
         rays_d /= np.linalg.norm(rays_d, axis=-1, keepdims=True)
         rays_o = np.broadcast_to(self.c2w[:3, 3], rays_d.shape)
         return rays_o.astype(np.float32), rays_d.astype(np.float32)
+
+
+def _own_pose(c2w: object) -> np.ndarray:
+    own = np.array(c2w, np.float64)
+    own.flags.writeable = False
+    return own
+
+
+def _whole(number: Any) -> int:
+    if number != int(number):
+        raise ValueError(number)
+    return int(number)
+
+
+_CONVERSIONS: dict[str, tuple[Callable[[Any], object], str]] = {
+    "c2w": (_own_pose, "4 rows of 4 numbers"),
+    **dict.fromkeys(("width", "height"), (_whole, "a whole number")),
+    **dict.fromkeys(("fx", "fy", "cx", "cy"), (float, "a number")),
+}
+"""What a camera makes of what it is given, which may be a list or numbers of numpy: a copy, and numbers that
+can be written as JSON. With each, what is expected."""
 
 
 def check_pose(c2w: np.ndarray, where: str) -> None:

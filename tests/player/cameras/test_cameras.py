@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -63,6 +64,42 @@ def test_the_turn_between_opengl_and_opencv_goes_both_ways():
     """Between OpenGL and OpenCV, right stays right, up becomes down and behind becomes ahead, both ways."""
     np.testing.assert_array_equal(OPENGL_FROM_OPENCV @ [1, 2, 3, 1], [1, -2, -3, 1])
     np.testing.assert_array_equal(POSE @ OPENGL_FROM_OPENCV @ OPENGL_FROM_OPENCV, POSE)
+
+
+def test_a_camera_keeps_copies_and_plain_numbers():
+    """A loop may move one matrix on and make a camera of it at each place; sizes and lenses may be numbers of
+    numpy, and a matrix may be a list."""
+    c2w, lens = np.eye(4, dtype=np.float32), np.float32([[9, 0, 4], [0, 8, 3], [0, 0, 1]])
+    cameras = []
+    for x in range(3):
+        c2w[0, 3] = x
+        size = np.int64(8), np.int32(6)
+        cameras.append(Camera("a", c2w, *size, lens[0, 0], lens[1, 1], lens[0, 2], lens[1, 2]))
+    assert [camera.c2w[0, 3] for camera in cameras] == [0, 1, 2]
+    numbers = {key: value for key, value in vars(cameras[0]).items() if key != "c2w"}
+    assert json.loads(json.dumps(numbers)) == {
+        "name": "a", "width": 8, "height": 6, "fx": 9.0, "fy": 8.0, "cx": 4.0, "cy": 3.0
+    }  # fmt: skip
+    with pytest.raises(ValueError, match="read-only"):
+        cameras[0].c2w[0, 3] = 5
+    assert Camera("a", np.eye(4).tolist(), 8, 6, 9, 9, 4, 3).c2w.dtype == np.float64
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"c2w": [[1, 2], [3]]}, "a: c2w: expected 4 rows of 4 numbers, got"),
+        ({"c2w": None}, "a: camera matrix: expected 4 rows of 4 numbers, got shape"),
+        ({"width": 7.5}, "a: width: expected a whole number, got 7.5"),
+        ({"height": float("nan")}, "a: height: expected a whole number, got nan"),
+        ({"fx": "wide"}, "a: fx: expected a number, got 'wide'"),
+        ({"cx": None}, "a: cx: expected a number, got None"),
+    ],
+)
+def test_what_is_no_camera_is_told(change: dict[str, Any], message: str):
+    camera = Camera("a", POSE, 8, 6, 9.0, 9.0, 4.0, 3.0)
+    with pytest.raises(FormatError, match=re.escape(message)):
+        replace(camera, **change)
 
 
 def test_blender_axes():

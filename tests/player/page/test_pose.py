@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -121,11 +122,11 @@ def test_poses_hold_training_views_exactly(call: Call) -> None:
     """Poses hold training views exactly, also those that are tilted or look straight down."""
     random = np.random.default_rng(3)
     views = cameras(RINGS["all around"], (1, 2, 3))
-    for view in views[::2]:
+    for number, view in enumerate(views[::2]):
         angle = random.uniform(-3, 3)
         turn = np.eye(4)
         turn[:2, :2] = [[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]]
-        view.c2w[:] = view.c2w @ turn
+        views[2 * number] = replace(view, c2w=view.c2w @ turn)
     down = np.eye(4)
     down[:3, 3] = 1, 2, 7
     views += [Camera("./down", down, 64, 48, 60.0, 61.0, 33.0, 23.0)]

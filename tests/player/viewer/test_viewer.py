@@ -106,8 +106,9 @@ def test_layers_show_what_they_say(asset: Asset) -> None:
 
 def test_layers_of_an_empty_picture(asset: Asset) -> None:
     camera = read_cameras(asset.path("cameras.json"))[0]
-    away = camera.transformed(np.diag([1.0, 1, 1, 1]))
-    away.c2w[:3, 3] += 1e3
+    far = np.eye(4)
+    far[:3, 3] = 1e3
+    away = camera.transformed(far)
     with Renderer(asset, 1) as renderer:
         frame = renderer.render(away)
     for layer in LAYERS[1:4]:
