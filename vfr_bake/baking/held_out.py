@@ -63,8 +63,7 @@ N_DIRECTIONS = 6
 SEED = 2
 """Seed of the views that are used for measuring only; views for training have other seeds."""
 FAR_OFF = 0.1
-"""Difference of a pixel in one of the three channels, 0 to 1, above which it stands out, as for the specks of
-`vfr_bake.bench.specks`."""
+"""Difference of a pixel in one of the three channels, 0 to 1, above which it stands out as a speck."""
 EXPECTED_SPREAD = 0.5
 """Standard error of the expected loss of a small change, as a share of that loss."""
 DEFAULT_PSNR = 30.0

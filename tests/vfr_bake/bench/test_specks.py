@@ -1,4 +1,4 @@
-"""Specks in synthetic pictures: which pixels count as specks, and which do not."""
+"""Specks in synthetic pictures, as a benchmark counts them: which pixels are specks, and which are not."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from player.errors import ShapeError
-from vfr_bake.bench.specks import speck_mask
+from tests.benchmarks.bench_specks import speck_mask
 
 
 def median_by_hand(picture: np.ndarray, y: int, x: int, channel: int) -> float:
@@ -30,7 +30,7 @@ def test_every_pixel_by_hand() -> None:
         calm = abs(wanted[y, x, channel] - median_by_hand(wanted, y, x, channel))
         expected[y, x] |= apart > 0.1 and calm <= 0.05
     assert 0 < expected.sum() < expected.size
-    assert np.array_equal(speck_mask(picture, wanted), expected)
+    assert np.array_equal(speck_mask(picture, wanted, 0.1), expected)
 
 
 def test_specks_count_where_they_are_and_in_any_channel() -> None:
@@ -40,9 +40,9 @@ def test_specks_count_where_they_are_and_in_any_channel() -> None:
     for number, (y, x) in enumerate(places):
         picture[y, x, number % 3] += 0.101
     # at a corner the repeated border shows the corner's own pixel in four of the nine places
-    assert {tuple(place) for place in np.argwhere(speck_mask(picture, wanted)).tolist()} == set(places)
+    assert {tuple(place) for place in np.argwhere(speck_mask(picture, wanted, 0.1)).tolist()} == set(places)
     assert not speck_mask(picture, wanted, 0.11).any(), "below the threshold"
-    assert not speck_mask(wanted, picture).any(), "what is missing in the picture is calm there"
+    assert not speck_mask(wanted, picture, 0.1).any(), "what is missing in the picture is calm there"
 
 
 def test_wires_highlights_edges_and_patches_do_not_count() -> None:
@@ -50,18 +50,18 @@ def test_wires_highlights_edges_and_patches_do_not_count() -> None:
     wanted[:, 5] = 0  # a wire
     wanted[3, 12] = 0  # a highlight, or a dot
     wanted[10:, 8:] = 0.3  # edges and a corner
-    assert not speck_mask(wanted, wanted).any()
+    assert not speck_mask(wanted, wanted, 0.1).any()
     shifted = wanted.copy()
     shifted[9:, 7:] = 0.3  # edges moved by a pixel: wrong, but no specks except at their corner
-    assert np.argwhere(speck_mask(shifted, wanted)[6:, 7:]).tolist() == [[3, 0]]
+    assert np.argwhere(speck_mask(shifted, wanted, 0.1)[6:, 7:]).tolist() == [[3, 0]]
     broken = wanted.copy()
     broken[10, 5] = 1  # a hole in the wire: white, as is the median of the nine pixels there
-    assert not speck_mask(broken, wanted)[10, 5]
+    assert not speck_mask(broken, wanted, 0.1)[10, 5]
     patch = wanted.copy()
     patch[14:18, 13:17] = 0.9
-    assert not speck_mask(patch, wanted)[14:18, 13:17][1:-1, 1:-1].any()
+    assert not speck_mask(patch, wanted, 0.1)[14:18, 13:17][1:-1, 1:-1].any()
 
 
 def test_pictures_of_two_sizes() -> None:
     with pytest.raises(ShapeError, match="specks: expected two pictures"):
-        speck_mask(np.zeros((4, 4, 3)), np.zeros((4, 5, 3)))
+        speck_mask(np.zeros((4, 4, 3)), np.zeros((4, 5, 3)), 0.1)
