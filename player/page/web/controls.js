@@ -32,10 +32,14 @@ export class Controls {
     this.pointers = new Map(); // by pointerId: { x, y, sideways }
     this.held = new Map(); // name of each held key: whether Shift was held, too
     this.tap = { at: 0, x: 0, y: 0, moved: 0 };
-    this.engaged = window.self === window.top; // an embedded page takes the wheel only after a click into it
     const { canvas } = viewer;
+    if (window.self === window.top) this.engage();
     const on = (target, type, handler, options) => target.addEventListener(type, handler.bind(this), options);
     on(canvas, "pointerdown", this.down);
+    on(canvas, "click", () => { // also by a tap
+      this.engage();
+      viewer.touch();
+    });
     on(canvas, "pointermove", this.drag);
     for (const type of ["pointerup", "pointercancel"]) on(canvas, type, this.up);
     on(canvas, "wheel", this.wheel, { passive: false });
@@ -47,9 +51,16 @@ export class Controls {
     viewer.step = (seconds) => this.step(seconds);
   }
 
+  // Take the wheel and fingers from now on. An embedded page leaves them to the page around it until it is clicked.
+  engage() {
+    this.engaged = true;
+    this.viewer.canvas.style.touchAction = "none";
+  }
+
   down(event) {
     const { viewer, pointers, tap } = this;
-    this.engaged = true;
+    if (!this.engaged && event.pointerType !== "mouse") return;
+    this.engage();
     viewer.touch();
     viewer.canvas.setPointerCapture(event.pointerId);
     const sideways = event.button > 0 || event.shiftKey;

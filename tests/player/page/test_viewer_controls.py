@@ -158,6 +158,38 @@ def test_one_finger_turns_and_two_move_and_zoom(chromium: Browser) -> None:
         wait_for(page, lambda: page.evaluate("() => asked.length") == 1)
 
 
+def test_embedded_fingers_scroll_the_page_around_it_until_it_is_tapped(chromium: Browser) -> None:
+    outer = (
+        b"<!doctype html><meta name=viewport content='width=device-width'><style>body{height:3000px}</style>"
+    )
+    outer += b"<iframe src='index.html#turn=off' width=300 height=300></iframe>"
+    with opened(chromium, {**FILES, "outer.html": outer}, wait=False, **PHONE) as (page, *_):
+        page.goto("http://localhost/scene/outer.html")
+        frame = page.frames[1]
+        frame.wait_for_selector("#canvas[data-done]")
+        touch, n = fingers(page), frame.evaluate("() => drawn.length")
+
+        def drag_up() -> None:
+            touch("touchStart", (150, 200))
+            for y in range(190, 90, -10):
+                touch("touchMove", (150, y))
+            touch("touchEnd")
+
+        page.evaluate("() => addEventListener('scrollend', () => (globalThis.isStill = true))")
+        drag_up()
+        page.wait_for_function(
+            "() => globalThis.isStill && scrollY > 50"
+        )  # a tap would only end the scrolling
+        assert frame.evaluate("() => drawn.length") == n
+        page.evaluate("() => scrollTo(0, 0)")
+        touch("touchStart", (150, 150))
+        touch("touchEnd")
+        frame.wait_for_function("() => document.getElementById('canvas').style.touchAction === 'none'")
+        drag_up()
+        frame.wait_for_function("n => drawn.length > n", arg=n)
+        assert page.evaluate("() => scrollY") == 0
+
+
 def test_keys_turn_zoom_and_fly(chromium: Browser) -> None:
     with opened(chromium, FILES, "#turn=off") as (page, *_):
         before = still(page)
