@@ -8,6 +8,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from hashlib import sha256
 from pathlib import Path
 
 import numpy as np
@@ -148,5 +149,5 @@ def unwritten_asset(folder: Path, manifest: Manifest, arrays: GridArrays, files:
     """
     for name, data in files.items():
         (folder / name).write_bytes(data)
-    entries = {name: FileEntry(len(data), "0" * 64) for name, data in files.items()}
+    entries = {name: FileEntry(len(data), sha256(data).hexdigest()) for name, data in files.items()}
     return Asset(folder, replace(manifest, files=entries), arrays)
