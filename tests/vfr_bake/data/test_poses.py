@@ -322,6 +322,17 @@ def test_blank_pictures(tmp_path: Path):
     assert "expected at least 5 of 5, got 0" in text and "blank" in text
 
 
+def test_cameras_of_a_form_that_is_not_read_are_named(tmp_path: Path):
+    """DTU's cameras are not read; before others are estimated (here in vain), a line says so."""
+    save(tmp_path / "image", [np.full((60, 80, 3), 200, np.uint8)] * 5)
+    save(tmp_path / "mask", [np.full((60, 80, 3), 255, np.uint8)] * 5)
+    (tmp_path / "cameras_sphere.npz").write_bytes(b"")
+    said: list[str] = []
+    with pytest.raises(DataError, match="expected at least 5 of 5, got 0"):
+        estimate_cameras(tmp_path, quiet, said.append)
+    assert said[0].startswith("cameras of the form of cameras_sphere.npz are not read: cameras are estimated")
+
+
 def test_all_blurred(tmp_path: Path):
     pictures = [cv2.GaussianBlur(textured(seed, 320, 240), (0, 0), 25) for seed in range(5)]
     text = message(save(tmp_path, pictures))

@@ -12,8 +12,11 @@ from vfr_bake.data.files.opening import SUFFIXES
 
 MOST = 20_000
 """Number of pictures of one capture at most: more are a whole collection, and not a scene."""
-NOT_PICTURES = (MASKS, "sparse", "colmap", "__MACOSX", "@eaDir")
-"""Folders that are not searched: masks, COLMAP's models, and the previews of some systems."""
+NOT_PICTURES = (MASKS, "mask", "sparse", "colmap", "__MACOSX", "@eaDir")
+"""Folders that are not searched: masks, also where other data sets have them, COLMAP's models, and the
+previews of some systems."""
+CAMERAS = ("cameras*.npz", "poses_bounds.npy", "pose/*.txt")
+"""Patterns of files in which other data sets have cameras (DTU, LLFF, and NSVF and Tanks and Temples)."""
 OWN = ("transforms.json", "transforms_train.json", "sparse", "manifest.json")
 """A subfolder that has one of these is a data set or an asset of its own, and is not searched."""
 
@@ -63,6 +66,17 @@ def _below(place: Path) -> list[Path]:
 
 def _is_own(folder: Path) -> bool:
     return any((folder / name).exists() for name in OWN)
+
+
+def unread_cameras(folder: Path) -> str | None:
+    """Return the name of a file with cameras of a form that is not read, relative to the folder; None if
+    there is none.
+
+    >>> unread_cameras(Path("surely/not/there")) is None
+    True
+    """
+    found = (path for pattern in CAMERAS for path in sorted(folder.glob(pattern)))
+    return next((path.relative_to(folder).as_posix() for path in found), None)
 
 
 def _order(name: str) -> list[tuple[int, str]]:

@@ -9,7 +9,7 @@ import pytest
 
 from player.errors import DataError
 from vfr_bake.data.files import listing
-from vfr_bake.data.files.listing import find_pictures
+from vfr_bake.data.files.listing import find_pictures, unread_cameras
 
 
 def touch(folder: Path, *names: str) -> None:
@@ -25,7 +25,9 @@ def names(folder: Path) -> list[str]:
 
 def test_folders_within_the_folder(tmp_path: Path) -> None:
     touch(tmp_path, "DCIM/101/IMG_2.jpg", "DCIM/100/IMG_10.HEIC", "DCIM/100/IMG_9.heic", "a.webp", "b.txt")
-    touch(tmp_path, "masks/a.png", "sparse/0/c.png", ".trash/d.png", "._e.jpg", "__MACOSX/f.jpg")
+    touch(
+        tmp_path, "masks/a.png", "mask/b.png", "sparse/0/c.png", ".trash/d.png", "._e.jpg", "__MACOSX/f.jpg"
+    )
     touch(tmp_path, "other/transforms.json", "other/g.png", "out/manifest.json", "out/h.png")
     assert names(tmp_path) == ["a.webp", "DCIM/100/IMG_9.heic", "DCIM/100/IMG_10.HEIC", "DCIM/101/IMG_2.jpg"]
 
@@ -34,6 +36,14 @@ def test_images_come_first(tmp_path: Path) -> None:
     touch(tmp_path, "images/left/1.png", "images/2.png", "preview.png")
     assert names(tmp_path) == ["2.png", "left/1.png"]
     assert find_pictures(tmp_path)[0] == tmp_path / "images"
+
+
+@pytest.mark.parametrize("name", ["cameras_sphere.npz", "poses_bounds.npy", "pose/0_0001.txt"])
+def test_cameras_of_other_forms_are_found(tmp_path: Path, name: str) -> None:
+    touch(tmp_path, "images/a.png", "intrinsics.txt", "cameras.json")
+    assert unread_cameras(tmp_path) is None
+    touch(tmp_path, name)
+    assert unread_cameras(tmp_path) == name
 
 
 def test_a_whole_disk_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
