@@ -10,6 +10,7 @@ import shutil
 import stat
 import zipfile
 import zlib
+from collections import Counter
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
 from player.errors import DataError, OutputError
@@ -20,8 +21,9 @@ from vfr_bake.data.files.source import check_source, note_source
 
 SUFFIX = ".zip"
 KEPT = (*SUFFIXES, ".bmp", ".json", ".bin")
-"""Suffixes of the files that are unpacked: pictures and masks, and the cameras of a data set. Other files are
-left packed."""
+"""Suffixes of the files that are unpacked: pictures and masks, and the cameras of a data set."""
+KEPT_TEXTS = ("cameras.txt", "images.txt", "points3D.txt")
+"""Names of further files that are unpacked: a COLMAP model as text. Other files are left packed."""
 MOST_ENTRIES = 50_000
 MOST_BYTES = 1 << 37
 """137 GB, more than ten thousand pictures of 12 MB."""
@@ -31,7 +33,6 @@ MOST_TIMES, SPARED = 50, 64 << 20
 compressed already, and hardly grow."""
 FREE = 0.9
 """Largest share of the free disk that is used."""
-_AT_ONCE = 1 << 20
 _DAMAGED = (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError, UnicodeError)
 """Exceptions that a damaged ZIP raises; the last one if a name is marked as UTF-8, and is not."""
 
@@ -75,7 +76,7 @@ def unpack(archive: Path, progress: Progress) -> Path:
             entries = _checked(archive, file)
             with new_folder(folder) as new:
                 for done, (entry, name) in enumerate(entries, start=1):
-                    _unpack_one(archive, file, entry, new / name)
+                    _unpack_one(file, entry, new / name)
                     progress(done, len(entries))
                 note_source(new, archive)
     except _DAMAGED as error:
@@ -93,8 +94,9 @@ def _checked(archive: Path, file: zipfile.ZipFile) -> list[tuple[zipfile.ZipInfo
     entries = []
     for entry in file.infolist():
         name = _safe_name(archive, entry)
-        kept = name.suffix.lower() in KEPT and not any(part.startswith((".", "__")) for part in name.parts)
-        if kept and not entry.is_dir():
+        kept = name.suffix.lower() in KEPT or name.name in KEPT_TEXTS
+        hidden = any(part.startswith((".", "__")) for part in name.parts)
+        if kept and not hidden and not entry.is_dir():
             if ":" in str(name) or any(ord(character) < 32 for character in str(name)):
                 raise DataError(
                     f"{archive}: ZIP: expected names without colons and control characters, got "
@@ -105,9 +107,9 @@ def _checked(archive: Path, file: zipfile.ZipFile) -> list[tuple[zipfile.ZipInfo
         raise DataError(f"{archive}: ZIP: expected one without a password: unpack it, and name the folder")
     if not entries:
         raise DataError(f"{archive}: ZIP: expected pictures ({', '.join(SUFFIXES)}) in it, got none")
-    folded = [str(name).casefold() for _, name in entries]
-    if len(set(folded)) < len(folded):
-        raise DataError(f"{archive}: ZIP: expected different names, got {_twice(folded)} twice")
+    (name, times), *_ = Counter(str(name).casefold() for _, name in entries).most_common(1)
+    if times > 1:
+        raise DataError(f"{archive}: ZIP: expected different names, got {name} {times} times")
     n_bytes = sum(entry.file_size for entry, _ in entries)
     most = min(MOST_BYTES, MOST_TIMES * archive.stat().st_size + SPARED)
     largest = max(entry.file_size for entry, _ in entries)
@@ -150,20 +152,11 @@ def _decoded(entry: zipfile.ZipInfo) -> str:
         return entry.filename
 
 
-def _unpack_one(archive: Path, file: zipfile.ZipFile, entry: zipfile.ZipInfo, target: Path) -> None:
+def _unpack_one(file: zipfile.ZipFile, entry: zipfile.ZipInfo, target: Path) -> None:
+    """Unpack an entry to `target`; `zipfile` ends it at the size that its directory states."""
     target.parent.mkdir(parents=True, exist_ok=True)
-    left = entry.file_size
     with file.open(entry) as source, target.open("xb") as copy:
-        while block := source.read(_AT_ONCE):
-            left -= len(block)
-            if left < 0:
-                raise DataError(f"{archive}: ZIP: {target.name}: expected {entry.file_size} bytes, got more")
-            copy.write(block)
-
-
-def _twice(names: list[str]) -> str:
-    seen: set[str] = set()
-    return next(name for name in names if name in seen or seen.add(name))
+        shutil.copyfileobj(source, copy)
 
 
 def _inner(folder: Path) -> Path:

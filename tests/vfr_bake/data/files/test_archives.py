@@ -17,6 +17,7 @@ from vfr_bake.data import load_scene, needs_cameras, unpacked
 from vfr_bake.data.files import archives
 from vfr_bake.data.files.archives import unpack
 from vfr_bake.data.files.listing import find_pictures
+from vfr_bake.data.poses import estimate_cameras
 
 
 def quiet(done: int, of: int) -> None:
@@ -78,6 +79,14 @@ def test_a_zip_of_a_data_set(small_data: Path, tmp_path: Path) -> None:
     assert len(load_scene(pack(tmp_path / "a.zip", files)).train.images) == 12
 
 
+def test_a_zip_with_a_model_as_text_meets_the_same_refusal_as_its_folder(tmp_path: Path) -> None:
+    model = dict.fromkeys(["sparse/0/cameras.txt", "sparse/0/images.txt", "sparse/0/points3D.txt"], b"#")
+    folder = unpack(pack(tmp_path / "a.zip", {"images/a.png": picture(), "readme.txt": b"x"} | model), quiet)
+    assert not (folder / "readme.txt").exists() and (folder / "sparse/0/points3D.txt").exists()
+    with pytest.raises(DataError, match="expected a COLMAP model in binary form, got one as text"):
+        estimate_cameras(folder, lambda stage, done, of: None)
+
+
 def test_names_of_what_stays_packed_do_not_matter(tmp_path: Path) -> None:
     """Names of entries that stay packed do not matter, such as that of macOS' icon, with a return in it."""
     files = dict.fromkeys(["IMG_1.png", "Icon\r", "notes 12:30.txt", "__MACOSX/a 12:30.png"], picture())
@@ -124,7 +133,10 @@ def damaged(path: Path) -> None:
         (lambda path: pack(path, {"b.png": picture(), "../a.txt": b"x"}), "expected names that stay in its"),
         (lambda path: pack(path, {"at 12:30.png": picture()}), "expected names without colons and control"),
         (lambda path: pack(path, {"a\rb.png": picture()}), "expected names without colons and control"),
-        (lambda path: pack(path, {"a.png": b"", "A.PNG": b""}), "expected different names, got a.png twice"),
+        (
+            lambda path: pack(path, {"a.png": b"", "A.PNG": b""}),
+            "different names, got a.png 2 times",
+        ),
         (lambda path: pack(path, {"a.txt": b"x"}), r"expected pictures \(\.png"),
         (link, "expected files, got a link"),
         (with_a_password, "expected one without a password"),
