@@ -66,8 +66,8 @@ def build_scene(capture: Capture, kind: SceneKind = "auto") -> Scene:
     """Build a `Scene` from pictures with cameras in the world: find its kind, and move the cameras to the
     model frame, which the training views alone decide.
 
-    Raises DataError if depth cannot be found (fewer than two training views, or all from one place), or if
-    nearly everything is masked.
+    Raises DataError if depth cannot be found (fewer than two training views, or all from one place), if
+    nearly everything is masked, or if all pictures are transparent.
 
     >>> from vfr_bake.data.demo import demo_capture
     >>> scene = build_scene(demo_capture(size=16, n_train=4, n_test=1))
@@ -78,6 +78,11 @@ def build_scene(capture: Capture, kind: SceneKind = "auto") -> Scene:
     _check_cameras(capture.name, train.cameras)
     has_alpha = not capture.masked and not all(train.opaque(number) for number in range(len(train.cameras)))
     some = _spread(train)
+    if has_alpha and kind != "unbounded" and not any(image[..., 3].any() for image in train.images):
+        raise DataError(
+            f"{capture.name}: training views: expected something to be seen, got pictures that are "
+            "transparent everywhere: save them with their colours, or without transparency"
+        )
     plain = None if has_alpha else _plain_border(some)
     unbounded = kind == "unbounded" or (kind == "auto" and not has_alpha and plain is None)
     if unbounded:

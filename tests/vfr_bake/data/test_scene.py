@@ -89,6 +89,17 @@ def test_the_kind_of_scene_is_seen_and_can_be_overruled():
     assert build_scene(Capture("alpha", train, test), "unbounded").unbounded
 
 
+def test_pictures_that_are_transparent_everywhere_are_refused():
+    train, test = demo_views(8, 4, 1)
+    nothing = PosedImages(train.cameras, [image * np.array([1, 1, 1, 0], np.uint8) for image in train.images])
+    with pytest.raises(
+        DataError, match="a: training views: expected something to be seen, got pictures that"
+    ):
+        build_scene(Capture("a", nothing, test))
+    one = PosedImages(train.cameras, [*nothing.images[:3], train.images[3]])
+    assert build_scene(Capture("a", one, test)).has_alpha
+
+
 def test_an_unbounded_scene_has_its_cameras_in_the_unit_ball():
     train, test = demo_views(24, 10, 2)
     scene = build_scene(Capture("a", train, test), "unbounded")
