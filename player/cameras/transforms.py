@@ -107,7 +107,7 @@ def transforms_number(document: dict[str, Any], frame: dict[str, Any], key: str,
         return None
     number = as_float(value)
     if number is None:
-        raise FormatError(f"{where}: {key}: expected a finite number, got {brief(value)}")
+        raise FormatError(f"{where}: {key}: expected a finite number, got {brief(repr(value))}")
     return number
 
 

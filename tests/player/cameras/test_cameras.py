@@ -226,7 +226,7 @@ BAD: list[tuple[str, Any, tuple[str, ...]]] = [
     ("far away", blender(transform_matrix=[[1, 0, 0, 1e300], *SKEWED[1:]]), ("expected a rotation",)),
     ("focal 0", blender(fl_x=0), ("fx: expected a positive focal length, got 0",)),
     ("focal negative", blender(fl_x=5, fl_y=-1), ("fy: expected a positive focal length, got -1",)),
-    ("focal a word", blender(fl_x="50"), ("fl_x: expected a finite number, got 50",)),
+    ("focal a word", blender(fl_x="50"), ("fl_x: expected a finite number, got '50'",)),
     ("no focal", {"frames": blender()["frames"]}, ("focal length: expected fl_x or camera_angle_x",)),
     ("angle 0", blender(camera_angle_x=0), ("camera_angle_x: expected radians between 0 and pi, got 0",)),
     ("angle in degrees", blender(camera_angle_x=50), ("between 0 and pi, got 50",)),

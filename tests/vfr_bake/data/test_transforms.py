@@ -413,8 +413,8 @@ def test_lenses_of_a_folder_are_undone(tmp_path: Path):
 
 
 def test_a_lens_that_is_not_a_number(tmp_path: Path):
-    assert "frame 0 (./r_0): k1: expected a finite number, got x" in message(
-        make_folder(tmp_path / "a", 3, k1="x"), FormatError
+    assert "frame 0 (./r_0): k1: expected a finite number, got '1'" in message(
+        make_folder(tmp_path / "a", 3, k1="1"), FormatError
     )
 
 
