@@ -7,16 +7,17 @@ neither on the number of threads nor on the size of a task.
 
 from __future__ import annotations
 
+import math
 import os
 import sys
 import threading
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from types import ModuleType
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 
@@ -24,6 +25,7 @@ from player.asset.asset import Asset
 from player.cameras.camera import Camera
 from player.errors import ConfigError, MissingExtraError
 from player.files.images import to_8_bit
+from player.files.json_files import brief
 from player.head.head import Head
 from player.march.bounds import block_bounds
 from player.march.interpolation import OPAQUE_DEPTH, MarchStage, Quality, interpolate, stages
@@ -34,6 +36,8 @@ from player.march.view import View
 from player.threads import bounded_threads, default_threads
 
 Background = Literal["transparent"] | tuple[float, float, float]
+Colour = Sequence[float] | np.ndarray
+"""Three numbers in 0..1: red, green, blue."""
 March = Literal["auto", "numpy", "numba"]
 
 MAX_PIXELS = 1 << 26
@@ -70,17 +74,25 @@ class Frame:
     """[h, w, n_channels] float32, the input of the head (in units of the codes), 0 where it was not run; None
     unless asked for with `layers`."""
     find_normals: Callable[[], np.ndarray] | None = None
-    """Function that computes `normals`."""
+    """Function that computes `normals`; None in a copy that was pickled."""
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what is pickled: normals that are already computed, but not the grid that others need."""
+        return vars(self) | {"find_normals": None}
 
     @cached_property
     def normals(self) -> np.ndarray:
         """[h, w, 3] float32, WORLD frame, of unit length or 0 (`player.march.normals`).
 
         They are computed when they are first asked for, at the cost of a second march, unless the frame was
-        rendered with `layers`. Raises ConfigError for a frame that was not made by a renderer.
+        rendered with `layers`. Raises ConfigError for a frame that was not made by a renderer, or was pickled
+        before they were computed.
         """
         if self.find_normals is None:
-            raise ConfigError("normals: expected the frame of a renderer, got one that was put together")
+            raise ConfigError(
+                "normals: expected the frame of a renderer, got one that was put together, or was pickled "
+                "without them: render with layers=True"
+            )
         return self.find_normals()
 
     def to_uint8(self) -> np.ndarray:
@@ -97,7 +109,8 @@ class Renderer:
     """
 
     def __init__(self, asset: Asset, n_threads: int | None = None, march: March = "auto") -> None:
-        """Raises MissingExtraError if `march` is "numba" and that is not installed or does not run here."""
+        """Raises MissingExtraError if `march` is "numba" and that is not installed or does not run here;
+        ConfigError if there is no such march, or `n_threads` is below 1."""
         self.n_threads = default_threads() if n_threads is None else bounded_threads(n_threads)
         self._grid = asset.grid  # built first: numba may still be importing (`import_ahead`)
         self.march, self._module = choose_march(march)
@@ -147,7 +160,7 @@ class Renderer:
         self,
         camera: Camera,
         n_fetches: int | None = None,
-        background: Background | None = None,
+        background: Background | Colour | None = None,
         layers: bool = False,
         quality: Quality = "exact",
     ) -> Frame:
@@ -165,15 +178,15 @@ class Renderer:
                 picture is the same.
 
         Raises:
-            ConfigError: a picture over MAX_PIXELS, or n_fetches out of range.
+            ConfigError: a picture over MAX_PIXELS, or a setting out of range.
         """
         k = self.asset.manifest.n_fetches if n_fetches is None else n_fetches
-        if k < 0:
-            raise ConfigError(f"samples: expected 0 (all) or more, got {k}")
+        if isinstance(k, bool) or not isinstance(k, int | np.integer) or k < 0:
+            raise ConfigError(f"samples: expected 0 (all) or more, a whole number, got {brief(k)}")
+        k = int(k)  # numba would compile the march again for an integer of numpy
         check_size(camera.width, camera.height)
-        if background is None:
-            red, green, blue = self.asset.manifest.background
-            background = (red, green, blue)
+        background = _background(self.asset.manifest.background if background is None else background)
+        _check_choice("quality", quality, get_args(Quality))
         reduced = self._reduced(quality)
         k = min((n for n in (k, reduced.n_fetches) if n), default=0)
         k = min(k, self._grid.most_samples)
@@ -183,15 +196,18 @@ class Renderer:
         view, planes, features = picture.view, picture.planes, picture.features
         shape = (camera.height, camera.width)
         normals = self._all_normals(view, self._threads().map) if layers else None
-        return Frame(
+        frame = Frame(
             planes.rgb.reshape(*shape, 3),
             planes.opacity.reshape(shape),
             planes.depth.reshape(shape),
             planes.n_density_samples.reshape(shape),
             background,
             None if features is None else features.reshape(*shape, -1),
-            lambda: self._all_normals(view) if normals is None else normals,
+            lambda: self._all_normals(view),
         )
+        if normals is not None:
+            vars(frame)["normals"] = normals  # already known
+        return frame
 
     def _reduced(self, quality: Quality) -> _Reduced:
         """Return the reductions of a quality, as far as the asset allows them."""
@@ -315,12 +331,33 @@ def check_size(width: int, height: int) -> None:
         )
 
 
+def _check_choice(name: str, value: object, allowed: tuple[str, ...]) -> None:
+    """Raise ConfigError if the setting `name` is none of the words that are allowed."""
+    if not isinstance(value, str) or value not in allowed:
+        raise ConfigError(f"{name}: expected {', '.join(allowed[:-1])} or {allowed[-1]}, got {brief(value)}")
+
+
+def _background(value: object) -> Background:
+    """Return a background as a frame has it. Raises ConfigError."""
+    if isinstance(value, str) and value == "transparent":
+        return "transparent"
+    try:
+        red, green, blue = (float(number) for number in value)  # type: ignore[attr-defined]
+    except (TypeError, ValueError):
+        red = green = blue = math.nan
+    if not all(0 <= number <= 1 for number in (red, green, blue)):
+        raise ConfigError(f'background: expected three numbers in 0..1 or "transparent", got {brief(value)}')
+    return red, green, blue
+
+
 def choose_march(name: March) -> tuple[str, ModuleType]:
     """Choose a march; returns its name and the module that has it. With "auto" it is the compiled one, if
     that is installed and was not found to be wrong.
 
-    Raises MissingExtraError: `name` is "numba", which is not installed or does not run here.
+    Raises MissingExtraError: `name` is "numba", which is not installed or does not run here; ConfigError:
+    there is no such march.
     """
+    _check_choice("march", name, get_args(March))
     if name != "numpy":
         from player import compiling, proof
 
@@ -378,7 +415,7 @@ def render(
     asset: Asset,
     camera: Camera,
     n_fetches: int | None = None,
-    background: Background | None = None,
+    background: Background | Colour | None = None,
     n_threads: int | None = None,
     march: March = "auto",
 ) -> Frame:

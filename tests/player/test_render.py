@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import pickle
 import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -200,6 +202,51 @@ def test_too_large_and_other_settings(asset: Asset, camera: Camera, monkeypatch:
         Renderer(asset, 1, "numba")
     with Renderer(asset, 1) as renderer:
         assert renderer.march == "numpy"
+
+
+@pytest.mark.parametrize(
+    "background",
+    [np.ones(3), np.float32([1, 1, 1]), [1, 1, 1], (1.0, np.float32(1), 1), np.ones(3, np.int64)],
+)
+def test_a_background_may_be_any_three_numbers(background: Any, asset: Asset, camera: Camera) -> None:
+    frame = render(asset, camera, background=background)
+    assert frame.background == (1.0, 1.0, 1.0)
+    assert frame.rgb.tobytes() == render(asset, camera, background=(1.0, 1.0, 1.0)).rgb.tobytes()
+
+
+def test_settings_that_are_none_are_told(asset: Asset, camera: Camera) -> None:
+    expected = r'background: expected three numbers in 0\.\.1 or "transparent", got '
+    for background in (
+        "white",
+        (255, 255, 255),
+        (0.5, 0.5),
+        np.ones((2, 3)),
+        (0, float("nan"), 0),
+        1.0,
+        [None] * 3,
+    ):
+        with pytest.raises(ConfigError, match=expected):
+            render(asset, camera, background=background)  # type: ignore[arg-type]
+    for n_fetches in (2.5, "5", True):
+        with pytest.raises(ConfigError, match=r"samples: expected 0 \(all\) or more, a whole number, got "):
+            render(asset, camera, n_fetches=n_fetches)  # type: ignore[arg-type]
+    assert render(asset, camera, n_fetches=np.int64(3)).rgb.shape == (40, 48, 3)  # type: ignore[arg-type]
+    with Renderer(asset, 1) as renderer, pytest.raises(ConfigError) as caught:
+        renderer.render(camera, quality="best")  # type: ignore[arg-type]
+    assert str(caught.value) == "quality: expected exact, high or fast, got best"
+    with pytest.raises(ConfigError, match="march: expected auto, numpy or numba, got foo"):
+        Renderer(asset, 1, "foo")  # type: ignore[arg-type]
+
+
+def test_a_frame_is_pickled_with_the_layers_that_it_has(asset: Asset, camera: Camera) -> None:
+    with Renderer(asset, 1) as renderer:
+        whole, other = (renderer.render(camera, layers=layers) for layers in (True, False))
+    whole, again = pickle.loads(pickle.dumps((whole, other)))
+    assert again.rgb.tobytes() == other.rgb.tobytes() and again.background == other.background
+    assert whole.normals.tobytes() == other.normals.tobytes() and whole.features.any()
+    with pytest.raises(ConfigError, match=r"normals: expected .* was pickled without them: render with"):
+        again.normals  # noqa: B018
+    assert pickle.loads(pickle.dumps(other)).normals.tobytes() == other.normals.tobytes()
 
 
 def test_head_is_the_formula_in_any_number_of_pixels(asset: Asset) -> None:
