@@ -99,7 +99,8 @@ class Eval:
     """The data set, as for vfr-train."""
     json: Path | None = None
     """Write the means (psnr in dB, ssim, lpips; of 8-bit pictures; psnr_float and ssim_float unrounded) and
-    per_view as JSON to this file; - for stdout. A PSNR without bound is null."""
+    per_view as JSON to this file; - for stdout. A PSNR without bound is null, and so is LPIPS where a view
+    has masked pixels."""
     lpips: Literal["alex", "vgg"] | None = None
     """Also measure LPIPS with this network, whose weights have to be on this machine."""
     max_memory: float | None = None
