@@ -16,13 +16,21 @@ const RESET = "The graphics card was reset. If the picture does not come back by
 
 // Show the scene; resolve to the renderer when all of the scene is there, and reject if it cannot all be shown.
 async function show() {
-  const options = optionsOf(location.hash), canvas = document.getElementById("canvas");
-  const panel = new Panel(options);
+  const canvas = document.getElementById("canvas"), panel = new Panel();
   const calm = matchMedia("(prefers-reduced-motion: reduce)").matches;
   let renderer = null, viewer = null, problem = null, advice = ANEW;
   let said = "Loading…"; // the text below the picture, unless the graphics card was reset
   panel.say(said);
   canvas.addEventListener("webglcontextlost", () => panel.say(RESET));
+  let options;
+  const follow = () => {
+    options = optionsOf(location.hash);
+    panel.follow(options);
+    viewer?.flyToView(options.view);
+    viewer?.follow(options);
+  };
+  follow();
+  addEventListener("hashchange", follow);
   try {
     for await (const scene of loadScene(({ done, total }) => panel.progress(done / total))) {
       problem = scene.problem;

@@ -7,19 +7,22 @@ const LAYERS = ["colour", "depth", "normals", "opacity"];
 const element = (id) => document.getElementById(id);
 
 export class Panel {
-  // Set up what is shown before there is a scene; `options` are those of the page's address.
-  constructor(options) {
-    document.body.classList.toggle("plain", Boolean(options.noui));
-    if (options.background === "transparent") {
-      document.body.classList.add("clear");
-      // Browsers make a frame opaque whose colour scheme is not that of the page around it, which mostly is the light one.
-      document.documentElement.style.colorScheme = "light";
-    }
+  // Set up what is shown before there is a scene.
+  constructor() {
     element("title").textContent = document.title;
     element("poster").alt = `Preview of ${document.title}`;
     const card = element("card");
     card.addEventListener("click", (event) => event.target === card && card.close()); // beside the card
     element("close").addEventListener("click", () => card.close());
+  }
+
+  // Follow the options of the page's address.
+  follow({ noui, background }) {
+    const isClear = background === "transparent", { classList } = document.body;
+    classList.toggle("plain", Boolean(noui));
+    classList.toggle("clear", isClear);
+    // Browsers make a frame opaque whose colour scheme is not that of the page around it, which mostly is the light one.
+    document.documentElement.style.colorScheme = isClear ? "light" : "";
   }
 
   // Show a line of text below the picture; "" removes it. After `fail`, its text stays.

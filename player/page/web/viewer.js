@@ -38,10 +38,8 @@ export class Viewer {
     this.flight = null; // { from, begin } while a flight is under way
     this.step = () => false; // moves the goal as time passes: (seconds) => whether it did
     this.onturn = this.onview = () => {};
-    this.again = options.turn === true && !calm;
-    this.turning = !calm && (options.turn ?? options.view === undefined);
-    this.quality = options.quality ?? "high";
-    this.background = options.background ?? background;
+    this.turning = options.view === undefined;
+    this.own = background;
     this.layer = "colour";
     this.pace = new Pace();
     this.covered = this.pose === pose; // the poster, which shows this pose, stays until all of the scene is there
@@ -53,7 +51,15 @@ export class Viewer {
     document.addEventListener("visibilitychange", () => {
       if (this.fence) this.fence.hidden = true;
     });
+    this.follow(options);
     this.watch();
+  }
+
+  // Follow the options of the page's address, other than its view.
+  follow({ turn, quality = "high", background = this.own }) {
+    this.again = turn === true && !this.calm;
+    this.set({ quality, background });
+    this.turn(!this.calm && (turn ?? this.turning));
   }
 
   // Draw anew, now and whenever a CSS pixel gets more or fewer pixels of the screen, as when the window moves to another one.

@@ -115,6 +115,28 @@ def test_options_in_the_address(chromium: Browser) -> None:
         assert not any(matches(view, camera) for camera in VIEWS) and view["background"] == "transparent"
 
 
+def test_an_address_that_changes_is_followed(chromium: Browser) -> None:
+    """As when a visitor edits the address, or a page around it gives its frame another one."""
+    with opened(chromium, FILES, "#turn=off") as (page, *_):
+        still(page)
+        page.evaluate("() => { location.hash = 'view=3&quality=exact&noui&background=255,0,0'; }")
+        wait_for(page, lambda: matches(page.evaluate("() => drawn.at(-1)"), VIEWS[3]))
+        view = still(page)
+        assert view["quality"] == "exact" and view["background"] == [1, 0, 0]
+        assert not page.locator("#bar").is_visible()
+        assert page.locator("#views").evaluate("e => e.selectedIndex") == 4
+        page.evaluate("() => { location.hash = 'background=transparent'; }")
+        wait_for(page, lambda: page.evaluate("() => drawn.at(-1).background") == "transparent")
+        view = still(page)
+        assert view["quality"] == "high" and matches(view, VIEWS[3]), "it stays where it is"
+        assert page.locator("#bar").is_visible() and page.locator("body.clear").count() == 1
+        page.evaluate("() => { location.hash = 'turn'; }")
+        wait_for(page, lambda: turns(page))
+        assert page.evaluate("() => drawn.at(-1).background") == [1, 1, 1]
+        assert page.locator("body.clear").count() == 0
+        assert page.locator("#turn").get_attribute("aria-pressed") == "true"
+
+
 def test_the_list_knows_the_view_of_the_address(chromium: Browser) -> None:
     with opened(chromium, FILES, "#view=2&turn=off") as (page, *_):
         assert page.locator("#views").evaluate("e => e.selectedIndex") == 3, "the first line is no view"
