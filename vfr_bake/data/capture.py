@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from abc import abstractmethod
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
@@ -11,51 +10,9 @@ import numpy as np
 from player.cameras.camera import Camera
 from player.errors import ShapeError
 from player.files.memory import give_back
+from vfr_bake.data.store.stored import StoredImages
 
 HOLD_OUT_EVERY = 8
-
-
-class StoredImages(Sequence[np.ndarray]):
-    """Pictures on a disk. Each, [height, width, 4] uint8, is read when it is asked for.
-
-    Their pixels are also divided into *chunks*. A chunk holds a share of the pixels of every picture, spread
-    over the whole picture, and lies in one place on the disk. A caller that draws pixels at random draws them
-    from one chunk after the other.
-    """
-
-    n_chunks: int
-
-    @abstractmethod
-    def some(self, numbers: Sequence[int]) -> StoredImages:
-        """Return the pictures with these numbers."""
-
-    @abstractmethod
-    def size(self, number: int) -> tuple[int, int]:
-        """Return the width and height of a picture without reading it."""
-
-    @abstractmethod
-    def opaque(self, number: int) -> bool:
-        """Return whether all of a picture is opaque, without reading it."""
-
-    @abstractmethod
-    def pixels(self, number: int, pixels: np.ndarray) -> np.ndarray:
-        """Read only the given `pixels` [n] of a picture, numbered in row-major order. Returns [n, 4]
-        uint8."""
-
-    @abstractmethod
-    def chunk(self, number: int) -> np.ndarray:
-        """Read the pixels of a chunk, [n, 3 or 4] uint8, picture after picture."""
-
-    @abstractmethod
-    def chunk_places(self, number: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return the first place of each picture's pixels in a chunk, and the place behind the last,
-        [n_pictures] int64 each. The pixel at place p of a picture of n pixels is number (`stride` p) modulo n
-        in row-major order."""
-
-    @property
-    @abstractmethod
-    def strides(self) -> np.ndarray:
-        """The stride of each picture, [n_pictures] int64: see `chunk_places`."""
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,8 @@ import torch
 from torch import Tensor
 
 from player.errors import TrainingError
-from vfr_bake.data.capture import PosedImages, StoredImages
+from vfr_bake.data.capture import PosedImages
+from vfr_bake.data.store.stored import StoredImages
 from vfr_bake.data.witnesses import Witnesses
 from vfr_bake.training.detail import detail_lots
 
@@ -52,7 +53,7 @@ class Batch(RayBatch):
 
 class PicturePixels(NamedTuple):
     """Pixels of all pictures, which may differ in size: all of them, or one chunk of those on a disk
-    (`vfr_bake.data.capture.StoredImages`). The members are arrays, or tensors on one device."""
+    (`vfr_bake.data.store.stored.StoredImages`). The members are arrays, or tensors on one device."""
 
     rgba: Any
     """[n_pixels, 4] uint8, or 3 channels if all are opaque, picture after picture."""

@@ -18,15 +18,16 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from player.cameras.camera import Camera
 from player.errors import FormatError, OutputError
 from player.files.files import new_folder
 from player.files.json_files import parse_json, read_json
 from player.kept_code import user_folder
+from vfr_bake.data.capture import PosedImages
 from vfr_bake.data.files.pictures import DescribedView
-from vfr_bake.data.store.stored import MappedImages, StoreLayout, map_pictures
+from vfr_bake.data.store.stored import StoreLayout, map_pictures
 from vfr_bake.data.store.working import WorkingSize
 
 VERSION = 2
@@ -37,13 +38,6 @@ GRACE = 600.0
 RESERVE = 500_000_000
 """Bytes that stay free on the disk."""
 INDEX, PIXELS, MODELS = "index.json", "pixels.bin", "models.txt"
-
-
-class CachedPictures(NamedTuple):
-    """A set of pictures at the working size."""
-
-    cameras: list[Camera]
-    images: MappedImages
 
 
 def cache_folder() -> Path:
@@ -70,7 +64,7 @@ def _described(part: object) -> object:
     return part
 
 
-def opened(folder: Path, described: Sequence[DescribedView]) -> CachedPictures | None:
+def opened(folder: Path, described: Sequence[DescribedView]) -> PosedImages | None:
     """Open the set in `folder`, with the poses of the pictures as they are `described`; None if there is no
     set, or none that is whole."""
     try:
@@ -85,9 +79,9 @@ def opened(folder: Path, described: Sequence[DescribedView]) -> CachedPictures |
             Camera(view.camera.name, view.camera.c2w, *size, *numbers)
             for view, size, numbers in zip(described, index["sizes"], index["intrinsics"], strict=True)
         ]
+        return PosedImages(cameras, images)
     except (FormatError, OSError, ValueError, LookupError, ArithmeticError, TypeError):
         return None
-    return CachedPictures(cameras, images)
 
 
 def index_bytes(

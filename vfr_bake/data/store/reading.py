@@ -119,7 +119,7 @@ class PictureReader:
                 progress(len(described), len(described))
         if self._model is not None and folder.is_dir():
             cache.note_use(folder, self._model)
-        return PosedImages(found.cameras, found.images)
+        return found
 
     def _longest(self, sizes: Sequence[tuple[int, int]]) -> int:
         return max(max(self.size.size(*size)) for size in sizes)
@@ -173,7 +173,7 @@ class PictureReader:
         folder: Path,
         n_channels: int,
         progress: Progress | None,
-    ) -> cache.CachedPictures:
+    ) -> PosedImages:
         layout = StoreLayout.of(self.size.size(*size) for size in sizes)
         n_bytes = int(layout.chunks[-1]) * n_channels
         try:
@@ -254,7 +254,7 @@ def _n_channels(described: Sequence[DescribedView]) -> int:
     return 3 if opaque else 4
 
 
-def _whole(folder: Path, described: Sequence[DescribedView]) -> cache.CachedPictures:
+def _whole(folder: Path, described: Sequence[DescribedView]) -> PosedImages:
     found = cache.opened(folder, described)
     if found is None:
         raise OutputError(f"{folder}: pictures: what was written cannot be read again")

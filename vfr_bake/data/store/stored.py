@@ -22,8 +22,6 @@ from typing import BinaryIO, NamedTuple, overload
 
 import numpy as np
 
-from vfr_bake.data.capture import StoredImages
-
 PIXELS_OF_A_PIECE = 8192
 """Approximate number of pixels in a piece. A disk reads and writes scattered pieces of this size, some 24 kB,
 about as fast as one whole file."""
@@ -113,8 +111,14 @@ def _order(n_pixels: int) -> np.ndarray:
     return order
 
 
-class MappedImages(StoredImages):
-    """Some or all of the pictures of a file that `write_picture` has filled."""
+class StoredImages(Sequence[np.ndarray]):
+    """Some or all of the pictures of a file that `write_picture` has filled. Each, [height, width, 4] uint8,
+    is read when it is asked for.
+
+    Their pixels are also divided into *chunks*. A chunk holds a share of the pixels of every picture, spread
+    over the whole picture, and lies in one place on the disk. A caller that draws pixels at random draws them
+    from one chunk after the other.
+    """
 
     def __init__(
         self,
@@ -153,17 +157,22 @@ class MappedImages(StoredImages):
         image[_order(height * width)] = places.view(np.uint32)[:, 0]
         return image.view(np.uint8).reshape(height, width, 4)
 
-    def some(self, numbers: Sequence[int]) -> MappedImages:
-        return MappedImages(self._file, self._layout, self._transparent, [self._numbers[i] for i in numbers])
+    def some(self, numbers: Sequence[int]) -> StoredImages:
+        """Return the pictures with these numbers."""
+        return StoredImages(self._file, self._layout, self._transparent, [self._numbers[i] for i in numbers])
 
     def size(self, number: int) -> tuple[int, int]:
+        """Return the width and height of a picture without reading it."""
         width, height = self._layout.sizes[self._numbers[number]].tolist()
         return width, height
 
     def opaque(self, number: int) -> bool:
+        """Return whether all of a picture is opaque, without reading it."""
         return self._numbers[number] not in self._transparent
 
     def pixels(self, number: int, pixels: np.ndarray) -> np.ndarray:
+        """Read only the given `pixels` [n] of a picture, numbered in row-major order. Returns [n, 4]
+        uint8."""
         which = self._numbers[number]
         n_pixels = int(self._layout.sizes[which].prod())
         places = np.asarray(pixels, np.int64) * pow(stride_of(n_pixels), -1, n_pixels) % n_pixels
@@ -175,6 +184,7 @@ class MappedImages(StoredImages):
         return rgba
 
     def chunk(self, number: int) -> np.ndarray:
+        """Read the pixels of a chunk, [n, 3 or 4] uint8, picture after picture."""
         begins, edges = self._layout.begins[:, number], self._layout.edges
         pieces = [
             self._file[begins[i] : begins[i] + edges[i, number + 1] - edges[i, number]] for i in self._numbers
@@ -184,11 +194,15 @@ class MappedImages(StoredImages):
         return np.concatenate(pieces)
 
     def chunk_places(self, number: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return the first place of each picture's pixels in a chunk, and the place behind the last,
+        [n_pictures] int64 each. The pixel at place p of a picture of n pixels is number (`stride` p) modulo n
+        in row-major order."""
         edges = self._layout.edges[self._numbers]
         return edges[:, number], edges[:, number + 1]
 
     @property
     def strides(self) -> np.ndarray:
+        """The stride of each picture, [n_pictures] int64: see `chunk_places`."""
         return np.array([stride_of(int(n)) for n in self._layout.sizes[self._numbers].prod(axis=1)])
 
     def _expect(self, chunk: int) -> None:
@@ -202,8 +216,8 @@ class MappedImages(StoredImages):
 
 def map_pictures(
     path: Path, layout: StoreLayout, n_channels: int, transparent: frozenset[int]
-) -> MappedImages:
+) -> StoredImages:
     """Map the pictures of a file into memory; none of them is read yet. Raises OSError, ValueError (the file
     is too short)."""
     file = np.memmap(path, np.uint8, "r", shape=(int(layout.chunks[-1]), n_channels))
-    return MappedImages(file, layout, transparent)
+    return StoredImages(file, layout, transparent)

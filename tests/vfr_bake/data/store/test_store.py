@@ -16,11 +16,10 @@ from player.cameras.transforms import write_cameras
 from player.errors import OutputError
 from player.files.replace import clear_up
 from vfr_bake.data import PosedImages, load_scene
-from vfr_bake.data.capture import StoredImages
 from vfr_bake.data.demo import demo_cameras
 from vfr_bake.data.store import cache, reading, stored
 from vfr_bake.data.store.reading import PictureReader
-from vfr_bake.data.store.stored import StoreLayout, in_order, map_pictures, write_picture
+from vfr_bake.data.store.stored import StoredImages, StoreLayout, in_order, map_pictures, write_picture
 from vfr_bake.data.store.working import WorkingSize
 from vfr_bake.data.witnesses import choose_witnesses
 from vfr_bake.training.rays import DevicePixelSampler, PixelSampler
@@ -42,7 +41,7 @@ def pictures(n_channels: int) -> list[np.ndarray]:
     return images
 
 
-def written(folder: Path, images: list[np.ndarray], n_channels: int) -> stored.MappedImages:
+def written(folder: Path, images: list[np.ndarray], n_channels: int) -> StoredImages:
     layout = StoreLayout.of((image.shape[1], image.shape[0]) for image in images)
     path = folder / "pixels.bin"
     cache.reserve(path, int(layout.chunks[-1]) * n_channels)
