@@ -95,7 +95,7 @@ def caster(mesh: TriangleMesh) -> Any:
 
 
 def true_normals(points: np.ndarray) -> np.ndarray:
-    from vfr_bake.data.demo import signed_distance
+    from vfr_bake.data.demo_solids import signed_distance
 
     steps = 1e-4 * np.eye(3)
     slopes = np.stack([signed_distance(points + e) - signed_distance(points - e) for e in steps], axis=-1)
@@ -132,7 +132,7 @@ def bench_levels(asset: Asset, points: np.ndarray) -> None:
 
 
 def bench_demo(asset: Asset, methods: list[str]) -> None:
-    from vfr_bake.data.demo import signed_distance
+    from vfr_bake.data.demo_solids import signed_distance
 
     voxel = voxel_size(asset.grid) * asset.scale
     cameras = cameras_of(asset, None)[::8]

@@ -14,7 +14,8 @@ import numpy as np
 from player.cameras.camera import Camera
 from tests.vfr_bake.baking.scenes import chord, fog_and_wires
 from vfr_bake.data.capture import Capture, PosedImages, held_out
-from vfr_bake.data.demo import CENTRE, SCALE, demo_cameras, demo_views
+from vfr_bake.data.demo import demo_cameras, demo_views
+from vfr_bake.data.demo_solids import CENTRE, SCALE
 
 Tracer = Callable[[np.ndarray, np.ndarray], np.ndarray]
 

@@ -24,7 +24,8 @@ def scene_box(
     Without silhouettes, the cube is centred where the optical axes meet, and is as large as what the cameras
     see there. With silhouettes, it is the box of the visual hull, with a margin of 1.5 cells of its grid.
 
-    >>> from vfr_bake.data.demo import AABB, demo_views
+    >>> from vfr_bake.data.demo import demo_views
+    >>> from vfr_bake.data.demo_solids import AABB
     >>> train, _ = demo_views(size=32, n_train=12, n_test=0)
     >>> centre, half = scene_box(train.cameras, [image[..., 3] for image in train.images])
     >>> bool((centre - half < AABB[0]).all() and (centre + half > AABB[1]).all())

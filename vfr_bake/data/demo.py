@@ -1,9 +1,7 @@
 """The built-in scene: analytic solids of known geometry and size, ray traced in seconds.
 
 A checkered plate carries a glossy ball, a textured cube, a slab with a hole through it, a golden ball, a ring
-and a thin wire arch. Every solid is a signed distance function that is exact outside the solid, so
-`signed_distance` is the truth that meshes are compared with. The solids are defined in `demo_solids`, and
-their lighting in `demo_shading`.
+and a thin wire arch. The solids are defined in `demo_solids`, and their lighting in `demo_shading`.
 
 The world frame differs from the scene's own frame, where its box is about [-1, 1]³, by `CENTRE` and `SCALE`.
 Vectors in the scene's own frame are stored component first, [3, n].
@@ -17,63 +15,14 @@ from player.cameras.camera import Camera
 from player.progress import Progress
 from vfr_bake.data.capture import Capture, PosedImages
 from vfr_bake.data.demo_shading import shade
-from vfr_bake.data.demo_solids import (
-    AABB,
-    BALL_CENTRE,
-    BALL_RADIUS,
-    CENTRE,
-    HIGH,
-    HOLE_ANGLE,
-    HOLE_CENTRE,
-    HOLE_RADIUS,
-    LOW,
-    SCALE,
-    SOLIDS,
-    WIRE_RADIUS,
-    enter,
-    inverse,
-    scene_distance,
-)
+from vfr_bake.data.demo_solids import CENTRE, HIGH, LOW, SCALE, SOLIDS, enter, inverse
 from vfr_bake.data.scene import Scene, build_scene
 from vfr_bake.data.threads import in_threads
-
-__all__ = [
-    "AABB",
-    "BALL_CENTRE",
-    "BALL_RADIUS",
-    "CENTRE",
-    "HOLE_ANGLE",
-    "HOLE_CENTRE",
-    "HOLE_RADIUS",
-    "SCALE",
-    "WIRE_RADIUS",
-    "demo_cameras",
-    "demo_capture",
-    "demo_scene",
-    "demo_views",
-    "signed_distance",
-    "trace",
-]
 
 _MAX_ROUNDS = 32
 _SKIN = 1e-5
 _PRECISION = 1e-4
 _RAYS_AT_ONCE = 65536
-
-
-def signed_distance(points: np.ndarray) -> np.ndarray:
-    """Return the distance to the nearest surface, negative inside.
-
-    It is exact outside. Inside, where solids touch, it is a bound with the right sign.
-
-    `points`: [n, 3] world units. Returns [n] float64, world units.
-
-    >>> ahead = BALL_CENTRE - [0, BALL_RADIUS + 0.1, 0]
-    >>> signed_distance(np.stack([ahead, BALL_CENTRE])).round(6).tolist()
-    [0.1, -0.256]
-    """
-    p = (np.asarray(points, np.float64).reshape(-1, 3).T - CENTRE[:, None]) / SCALE
-    return scene_distance(p) * SCALE
 
 
 def trace(camera: Camera) -> tuple[np.ndarray, np.ndarray]:

@@ -225,6 +225,21 @@ def scene_distance(p: np.ndarray) -> np.ndarray:
 # --- rays and boxes ---
 
 
+def signed_distance(points: np.ndarray) -> np.ndarray:
+    """Return the distance to the nearest surface, negative inside.
+
+    It is exact outside. Inside, where solids touch, it is a bound with the right sign.
+
+    `points`: [n, 3] world units. Returns [n] float64, world units.
+
+    >>> ahead = BALL_CENTRE - [0, BALL_RADIUS + 0.1, 0]
+    >>> signed_distance(np.stack([ahead, BALL_CENTRE])).round(6).tolist()
+    [0.1, -0.256]
+    """
+    p = (np.asarray(points, np.float64).reshape(-1, 3).T - CENTRE[:, None]) / SCALE
+    return scene_distance(p) * SCALE
+
+
 def enter(
     low: np.ndarray, high: np.ndarray, origin: np.ndarray, reciprocal: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:

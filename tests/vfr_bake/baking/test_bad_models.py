@@ -16,6 +16,7 @@ from player.render import render
 from vfr_bake.baking.bake import bake
 from vfr_bake.config import BakeConfig, TrainConfig
 from vfr_bake.data import demo
+from vfr_bake.data.demo_solids import CENTRE, SCALE
 from vfr_bake.rendering.render import render_image
 from vfr_bake.training.model_file import Model
 from vfr_bake.training.scores.metrics import psnr
@@ -68,7 +69,7 @@ def test_a_grid_becomes_coarser_where_the_bytes_do_not_hold_it(
 def test_a_scene_far_larger_than_its_cameras_plays_what_the_model_shows(model: Model, tmp_path: Path) -> None:
     """If all cameras are within a thousandth of the box, looking as before, the grid is as fine as it may be,
     and what these cameras see is stored."""
-    middle = demo.CENTRE + demo.SCALE * np.array([0.0, 0.0, 0.3])  # above the ball, with the plate in view
+    middle = CENTRE + SCALE * np.array([0.0, 0.0, 0.3])  # above the ball, with the plate in view
     cameras = []
     for camera in model.cameras:
         c2w = camera.c2w.copy()

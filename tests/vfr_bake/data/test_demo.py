@@ -11,7 +11,8 @@ from player.cameras.camera import Camera
 from player.render import render
 from vfr_bake.data import demo as module
 from vfr_bake.data import load_scene
-from vfr_bake.data.demo import (
+from vfr_bake.data.demo import demo_cameras, demo_capture, demo_scene, demo_views, trace
+from vfr_bake.data.demo_solids import (
     AABB,
     BALL_CENTRE,
     BALL_RADIUS,
@@ -21,12 +22,7 @@ from vfr_bake.data.demo import (
     HOLE_RADIUS,
     SCALE,
     WIRE_RADIUS,
-    demo_cameras,
-    demo_capture,
-    demo_scene,
-    demo_views,
     signed_distance,
-    trace,
 )
 
 
