@@ -118,8 +118,6 @@ def needs_cameras(data: str | Path) -> bool:
     """Return whether `data` is a video or a folder of pictures without cameras, so that
     `poses.estimate_cameras` has to find them."""
     folder = Path(data)
-    if str(data) == "demo":
-        return False
     if is_video(folder):
         return True
     known = not folder.is_dir() or has_transforms(folder) or colmap_folder(folder) is not None
