@@ -98,9 +98,12 @@ class Frame:
     def to_uint8(self) -> np.ndarray:
         """Return 8-bit values [h, w, 3], or [h, w, 4] with straight alpha if transparent; rounded to the
         nearest level."""
-        if self.background == "transparent":
-            return to_8_bit(np.concatenate([self.rgb, self.opacity[..., None]], axis=-1))
-        return to_8_bit(self.rgb)
+        if self.background != "transparent":
+            return to_8_bit(self.rgb)
+        levels = np.empty((*self.opacity.shape, 4), np.uint8)
+        to_8_bit(self.rgb, levels[..., :3])
+        to_8_bit(self.opacity, levels[..., 3])
+        return levels
 
 
 class Renderer:

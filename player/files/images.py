@@ -20,13 +20,24 @@ KEY = "vfr-play"
 """Name of the entry in a picture's metadata that says what was rendered (`player.app.frame_files`)."""
 
 
-def to_8_bit(values: np.ndarray) -> np.ndarray:
+BAND = 1 << 16
+"""Values that are rounded at a time: the arrays between take no memory to speak of, and stay in cache."""
+
+
+def to_8_bit(values: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
     """Convert values in [0, 1] to uint8, rounded to nearest; others are clipped.
+
+    `out`: the array of that shape to write into; a new one if None.
 
     >>> to_8_bit(np.array([0.0, 0.5, 1.0, 7.0])).tolist()
     [0, 128, 255, 255]
     """
-    return np.floor(np.clip(values, 0, 1) * 255 + 0.5).astype(np.uint8)
+    levels = np.empty(values.shape, np.uint8) if out is None else out
+    n_rows = max(BAND * len(values) // max(values.size, 1), 1)
+    for first in range(0, len(values), n_rows):
+        rows = slice(first, first + n_rows)
+        levels[rows] = np.floor(np.clip(values[rows], 0, 1) * 255 + 0.5)
+    return levels
 
 
 def png_bytes(pixels: np.ndarray, key: str | None = None) -> bytes:

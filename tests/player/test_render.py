@@ -5,6 +5,7 @@ from __future__ import annotations
 import pickle
 import subprocess
 import sys
+import tracemalloc
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -23,7 +24,7 @@ from player.head.head import CHUNK, Head
 from player.march import pixels
 from player.march.bounds import BLOCK, block_bounds
 from player.march.march import MarchResult, march
-from player.render import MAX_PIXELS, Renderer, render
+from player.render import FRAME_BYTES, MAX_PIXELS, Renderer, render
 from tests.numerics.bounds import Row
 from tests.player.conftest import head_arrays, head_bytes, look_at
 from tests.player.march.oracle_march import Scene, march_ray
@@ -182,6 +183,25 @@ def test_rounding_to_eight_bits() -> None:
     zeros = np.zeros((2, 1), np.float32)
     frame = render_module.Frame(values, zeros, zeros, zeros, (0.0, 0.0, 0.0))
     JOINTS.holds(frame.to_uint8() == [[[0, 0, 0]], [[1, 255, 255]]])
+
+
+@pytest.mark.parametrize("background", [(0.0, 0.0, 0.0), "transparent"])
+@pytest.mark.parametrize("size", [(1, 1), (700, 900), (3, 70_001), (70_001, 3)])
+def test_rounding_in_bands_is_the_formula_within_the_memory_of_a_frame(
+    size: tuple[int, int], background: render_module.Background
+) -> None:
+    rng = np.random.default_rng(2)
+    rgb, opacity = (rng.uniform(-0.2, 1.2, (*size, *more)).astype(np.float32) for more in ((3,), ()))
+    frame = render_module.Frame(rgb, opacity, opacity, opacity, background)
+    whole = rgb if background != "transparent" else np.concatenate([rgb, opacity[..., None]], axis=-1)
+    expected = np.floor(np.clip(whole, 0, 1) * 255 + 0.5).astype(np.uint8)
+    tracemalloc.start()
+    pixels = frame.to_uint8()
+    _, most = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert pixels.dtype == np.uint8 and pixels.tobytes() == expected.tobytes()
+    planes = 24  # bytes of the frame itself
+    assert most <= (FRAME_BYTES - planes) * opacity.size + 2e6
 
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 9), (8, 8), (17, 3)])
