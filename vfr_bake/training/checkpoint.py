@@ -20,6 +20,8 @@ FORMAT = "vfr-checkpoint"
 VERSION = [1, 6]
 LENGTH_SETTINGS = {"effort", "steps", "minutes", "eval_views", "checkpoint_minutes"}
 """Settings that may differ between the run that was interrupted and the one that continues it."""
+NO_LIMIT = 1e8
+"""Gigabytes of memory that reading may take: training has held all of it, and goes on with it."""
 SAME = 1e-4
 """Largest difference between numbers of cameras that count as the same: processors round differently."""
 
@@ -52,7 +54,7 @@ def load_checkpoint(path: Path, trainer: Trainer) -> None:
     Raises FormatError (not a checkpoint, or cut short) or ConfigError (the checkpoint is of a run with other
     settings or other pictures).
     """
-    content = read_tensors(path, "a checkpoint written by vfr-train")
+    content = read_tensors(path, "a checkpoint written by vfr-train", NO_LIMIT)
     if not isinstance(content, dict) or content.get("format") != FORMAT or content.get("version") != VERSION:
         raise FormatError(
             f"{path}: expected a checkpoint of this version of vfr-train: train without --resume"
