@@ -12,6 +12,7 @@ from typing import Any, Literal, get_args
 from player.app.option_types import size
 from player.errors import ConfigError
 from player.files.json_files import brief
+from player.files.memory import allowed_bytes
 from vfr_bake.presets import PRESETS, UNBOUNDED, BakeChoice, Preset
 
 SceneKind = Literal["auto", "object", "unbounded"]
@@ -309,6 +310,10 @@ class TrainConfig:
         )
 
 
+USUAL_MEMORY = 4.0
+"""Gigabytes of memory that a bake takes at most if no number is given."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class BakeConfig:
     """Settings of the bake. Those that are not given follow from the preset."""
@@ -354,12 +359,12 @@ class BakeConfig:
     target_ms: float | None = None
     """Take no wider a head and no more lookups than a frame of 800x800 in so many milliseconds allows,
     measured by the player on this machine; fail, and write nothing, if it takes longer all the same."""
-    max_memory: float = 4.0
+    max_memory: float | None = None
     """Gigabytes of memory that the bake may take: rays that are learned from and cells that are stored follow
-    from it."""
+    from it. Not given: 4, or half of the machine's memory if that is less."""
     check_views: int = 4
     """Views between the training cameras on which each step of the bake is compared with the model's own
-    pictures."""
+    pictures; 1 to 1,000."""
 
     def __post_init__(self) -> None:
         check(self, "preset", self.preset in PRESETS, f"one of {tuple(PRESETS)}")
@@ -367,11 +372,10 @@ class BakeConfig:
         most = self.resolution or 2048
         fits = self.feature_resolution is None or 8 <= self.feature_resolution <= most
         check(self, "feature_resolution", fits, "8 to 2048, at most the resolution")
-        for name in ("max_loss_db", "max_mb", "target_ms"):
+        for name in ("max_loss_db", "max_mb", "target_ms", "max_memory"):
             limit = getattr(self, name)
             check(self, name, limit is None or limit > 0, "more than 0")
-        check(self, "max_memory", self.max_memory > 0, "more than 0")
-        check(self, "check_views", self.check_views >= 1, "at least 1")
+        check(self, "check_views", 1 <= self.check_views <= 1000, "1 to 1,000")
         check(self, "k", self.k == "auto" or 0 <= self.k <= 64, "auto or 0 to 64")
         fits = self.weight_floor is None or 0 < self.weight_floor < 1
         check(self, "weight_floor", fits, "between 0 and 1")
@@ -385,6 +389,11 @@ class BakeConfig:
         check(choice, "head_bits", choice.head_bits in (8, 32), "8 or 32")
         fits = choice.mesh_resolution == 0 or 8 <= choice.mesh_resolution <= 1024
         check(choice, "mesh_resolution", fits, "0 or 8 to 1024")
+
+    @property
+    def memory(self) -> float:
+        """Gigabytes of memory that the bake may take on this machine."""
+        return min(USUAL_MEMORY, allowed_bytes() / 1e9) if self.max_memory is None else self.max_memory
 
     def choice(self, unbounded: bool = False) -> BakeChoice:
         """Return the preset's choice for an object or an unbounded scene; settings that are given replace it.

@@ -16,6 +16,11 @@ UNKNOWN = 4 << 30
 """Bytes of memory that the machine is assumed to have where the system does not tell."""
 
 
+def available_bytes() -> int:
+    """Return the bytes of memory that this process can have: its own limit, or all of the machine's."""
+    return min([*_limits(), _machine_bytes()])
+
+
 def allowed_bytes(max_memory: float | None = None) -> int:
     """Return the bytes of memory that a command may take.
 
@@ -28,7 +33,7 @@ def allowed_bytes(max_memory: float | None = None) -> int:
     1500000000
     """
     if max_memory is None:
-        return int(SHARE * min([*_limits(), _machine_bytes()]))
+        return int(SHARE * available_bytes())
     if not 0 < max_memory < 1e9:
         raise ConfigError(f"max_memory: expected gigabytes, more than 0, got {max_memory:g}")
     return int(max_memory * 1e9)

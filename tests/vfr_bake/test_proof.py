@@ -33,7 +33,7 @@ def test_a_bake_asks_before_it_begins(
     options = SimpleNamespace(
         asset=tmp_path / "asset",
         model=None,
-        config=SimpleNamespace(max_memory=4.0),
+        config=SimpleNamespace(max_memory=None, memory=4.0),
         force=False,
         json=None,
         convert=None,

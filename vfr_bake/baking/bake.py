@@ -177,7 +177,7 @@ class _Bake:
         def finish(new: Path) -> dict[str, bytes]:
             """Return the mesh and the report as files; the mesh comes last because its size limit depends on
             the other files. `figures` is part of the manifest, which is written again after this."""
-            asset = Asset.open(new, verify=True, max_memory=self.config.max_memory)
+            asset = Asset.open(new, verify=True, max_memory=self.config.memory)
             mesh, removed = self._mesh(asset, file_sizes(new))
             figures["mesh_faces"], figures["mesh_floaters_removed"] = len(mesh.faces), removed.floaters
             data = small_ply_bytes(mesh)
@@ -224,7 +224,7 @@ class _Bake:
     def _room_for_cells(self) -> Iterator[tuple[int, str]]:
         """Yield pairs: the number of feature cells that fit, and the name of the limit they fit into."""
         config, choice, plan = self.config, self.choice, self.plan
-        yield plan.most_cells, f"{config.max_memory:g} GB of memory"
+        yield plan.most_cells, f"{config.memory:.3g} GB of memory"
         if config.max_mb is not None:
             yield cells_that_fit(config.max_mb, self._other_bytes(config.max_mb)), f"{config.max_mb:g} MB"
         if np.isfinite(plan.page_cells):
@@ -235,7 +235,7 @@ class _Bake:
         most = mesh_bytes(sum(sizes.values()) - sizes["mesh.ply"], self.config.max_mb)
         resolution = self.choice.mesh_resolution or asset.manifest.resolution
         with self._part("mesh"):
-            baked = bake_mesh(asset, resolution, most, self.config.max_memory, self._report)
+            baked = bake_mesh(asset, resolution, most, self.config.memory, self._report)
         if baked.left_out is not None:
             self.left_out["mesh"] = baked.left_out
         return baked.mesh, baked.removed

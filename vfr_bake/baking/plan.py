@@ -156,7 +156,7 @@ def make_plan(model: Model, config: BakeConfig) -> Plan:
     n_channels = min(choice.n_channels, field.n_channels)
     cell_bytes = CHANNEL_BYTES * n_channels + 60
     cell_bytes += DENSITY_BYTES * (fine / coarse) ** 3
-    room = config.max_memory * 1e9 - PROGRAM_BYTES
+    room = config.memory * 1e9 - PROGRAM_BYTES
     given = config.resolution or config.feature_resolution
     page_cells = np.inf if given else cells_of_page(choice.page_mb, n_channels, (fine / coarse) ** 3)
     drawn = max(int(RAYS_OF_DRAW * choice.refine_steps * BATCH), FEW_DRAWN)
@@ -168,7 +168,7 @@ def make_plan(model: Model, config: BakeConfig) -> Plan:
         least = PROGRAM_BYTES + max(marks, FEWEST_RAYS * plan.ray_bytes)
         raise ConfigError(
             f"max_memory: expected at least {np.ceil(least / 1e7) / 100:.2f} GB for {fine} cells "
-            f"per axis, got {config.max_memory:g} GB: allow more, or lower --resolution and "
+            f"per axis, got {config.memory:.3g} GB: allow more, or lower --resolution and "
             "--feature-resolution"
         )
     return plan
@@ -182,7 +182,7 @@ def _resolutions(model: Model, config: BakeConfig) -> Resolutions:
         resolution = choice.contracted_resolution
     else:
         resolution = round(2 * choice.cells_per_pixel / float(np.median(pixel_footprints(model))))
-    room = max(config.max_memory * 1e9 - PROGRAM_BYTES, 0)
+    room = max(config.memory * 1e9 - PROGRAM_BYTES, 0)
     most = int(np.cbrt(room / _marks_bytes(model, config)))  # feature cells per axis whose marks fit
     if not config.resolution:
         resolution = min(resolution, int(most / choice.feature_share))

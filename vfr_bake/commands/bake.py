@@ -9,6 +9,7 @@ from typing import Any
 from player.app.commands import write_result
 from player.asset.target import check_asset_target
 from player.errors import ConfigError
+from player.files.memory import available_bytes
 from player.progress import Bar, Bars
 from vfr_bake.commands.targets import check_json_target
 from vfr_bake.config import BakeConfig
@@ -18,6 +19,12 @@ def bake_command(options: Any) -> int:
     """Bake as `options` says (`vfr_bake.options.Bake`), or convert an asset; return the exit code."""
     check_asset_target(options.asset, options.force)
     check_json_target(options.json, [options.model], options.asset)
+    if (options.config.max_memory or 0) > (there := available_bytes() / 1e9):
+        print(
+            f"vfr-bake: warning: --max-memory {options.config.max_memory:g} is more than the {there:.1f} GB "
+            "that there are: the system may end the bake",
+            file=sys.stderr,
+        )
     if options.convert:
         return _convert(options)
     from player.proof import prove
@@ -25,7 +32,7 @@ def bake_command(options: Any) -> int:
     from vfr_bake.baking.plan import COMPILE_SECONDS, expected_seconds, is_compiled, make_plan
     from vfr_bake.training.model_file import load_model
 
-    model = load_model(options.model, options.config.max_memory)
+    model = load_model(options.model, options.config.memory)
     check_bakeable(model, options.config)
     plan = make_plan(model, options.config)
     minutes = expected_seconds(model, options.config, plan) / 60
@@ -34,7 +41,7 @@ def bake_command(options: Any) -> int:
     compiling = "" if is_compiled() else first
     print(
         f"vfr-bake: about {max(minutes, 0.1):.1f} minutes{compiling} and {plan.n_bytes / 1e9:.1f} GB of "
-        f"memory ({options.config.max_memory:g} GB at most), densities on at most {fine} cells per axis and "
+        f"memory ({options.config.memory:.3g} GB at most), densities on at most {fine} cells per axis and "
         f"features on {coarse}, about {plan.n_rays(plan.n_cells):,} rays to learn from",
         file=sys.stderr,
     )
@@ -70,7 +77,7 @@ def _convert(options: Any) -> int:
     if given:
         raise ConfigError(f"--convert: expected no other setting than --max-memory, got {sorted(given)}")
     with Bar("converting") as bar:
-        done = convert(options.model, options.asset, options.config.max_memory, options.force, bar.count)
+        done = convert(options.model, options.asset, options.config.memory, options.force, bar.count)
     before = sum(entry.bytes for entry in done.asset.manifest.files.values())
     version = done.asset.manifest.version
     write_result(
