@@ -379,6 +379,8 @@ class BakeConfig:
         check(self, "k", self.k == "auto" or 0 <= self.k <= 64, "auto or 0 to 64")
         fits = self.weight_floor is None or 0 < self.weight_floor < 1
         check(self, "weight_floor", fits, "between 0 and 1")
+        fits = self.weight_floor is None or not self.no_cull
+        check(self, "weight_floor", fits, "none with --no-cull, which stores every cell")
         choice = self.choice()
         check(choice, "n_channels", 1 <= choice.n_channels <= 64, "1 to 64")
         check(choice, "code_levels", 7 <= choice.code_levels <= 127, "7 to 127")

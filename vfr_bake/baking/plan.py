@@ -11,7 +11,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from player.errors import ConfigError
+from player.cameras.transforms import write_cameras
+from player.errors import ConfigError, TrainingError
 from player.kept_code import is_kept
 from vfr_bake.baking.cells import (
     BLOCK,
@@ -25,7 +26,7 @@ from vfr_bake.baking.cells import (
 )
 from vfr_bake.baking.distillation import render_teacher
 from vfr_bake.baking.held_out import BETWEEN
-from vfr_bake.baking.limits import cells_of_page
+from vfr_bake.baking.limits import WIDTHS, cells_of_page
 from vfr_bake.baking.refinement import BATCH, HEAD_BATCH, head_steps, refined_steps
 from vfr_bake.config import BakeConfig
 from vfr_bake.kernels import SOURCES
@@ -145,11 +146,18 @@ class Plan:
 
 
 def make_plan(model: Model, config: BakeConfig) -> Plan:
-    """Plan a bake that takes at most `config.max_memory` gigabytes.
+    """Plan a bake that takes at most `config.memory` gigabytes.
 
-    Raises ConfigError if even the fewest rays, or the marks of the cells, do not fit.
+    Raises ConfigError if even the fewest rays, or the marks of the cells, do not fit; TrainingError if the
+    cameras and the head alone take more than `config.max_mb`.
     """
     choice, field = config.choice(model.field.config.unbounded), model.field.config
+    least = _fixed_bytes(model, config) / 1e6
+    if config.max_mb is not None and least >= config.max_mb:
+        raise TrainingError(
+            f"bake: size: expected at most {config.max_mb:g} MB, got {least:.2g} MB for {len(model.cameras)} "
+            "cameras and the head alone: nothing was written: allow more"
+        )
     resolutions = _resolutions(model, config)
     fine, coarse = resolutions
     marks = _marks_bytes(model, config) * coarse**3
@@ -172,6 +180,17 @@ def make_plan(model: Model, config: BakeConfig) -> Plan:
             "--feature-resolution"
         )
     return plan
+
+
+def _fixed_bytes(model: Model, config: BakeConfig) -> int:
+    """Return the least bytes that the cameras and the head take, however coarse the grids are."""
+    choice, field = config.choice(model.field.config.unbounded), model.field.config
+    width, n_layers = choice.head_width, choice.head_layers + 1
+    if config.target_ms is not None:
+        width = min(WIDTHS)  # the head may become so narrow
+    elif not width:
+        width, n_layers = field.head_width, field.n_directional_layers
+    return len(write_cameras(model.cameras)) + n_layers * width**2 * choice.head_bits // 8
 
 
 def _resolutions(model: Model, config: BakeConfig) -> Resolutions:

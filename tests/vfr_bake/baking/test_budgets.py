@@ -14,6 +14,7 @@ import pytest
 from exporters.formats.ply import read_ply
 from player.asset.asset import Asset
 from player.cameras.camera import Camera
+from player.cameras.transforms import write_cameras
 from player.errors import ConfigError, TrainingError
 from player.kept_code import is_kept
 from player.page.gpu_memory import TILE, gpu_bytes
@@ -110,6 +111,46 @@ def test_time_that_is_left_changes_nothing(model: Model, tmp_path: Path) -> None
     bake(model, tmp_path / "b", BakeConfig(target_ms=1e6, **SMALL), silent)
     a, b = (Asset.open(tmp_path / name).manifest for name in "ab")
     assert (a.n_fetches, a.files["head.onnx"].bytes) == (b.n_fetches, b.files["head.onnx"].bytes)
+
+
+def test_a_size_that_cannot_be_met_is_refused_when_the_bake_is_planned(model: Model) -> None:
+    """The cameras of the pictures, and the head, take bytes that no choice of grids saves."""
+    cameras = len(write_cameras(model.cameras))
+    head = model.field.config.n_directional_layers * model.field.config.head_width**2
+    for config, least in (
+        (BakeConfig(resolution=48, refine_steps=0), cameras + head),
+        (BakeConfig(resolution=48), cameras + (PRESETS["balanced"].head_layers + 1) * 64**2),
+        (BakeConfig(resolution=48, target_ms=50), cameras),
+    ):
+        with pytest.raises(TrainingError, match=r"bake: size: expected at most .* and the head alone"):
+            make_plan(model, replace(config, max_mb=0.99 * least / 1e6))
+    make_plan(model, BakeConfig(resolution=48, refine_steps=0, max_mb=1.01 * (cameras + head) / 1e6))
+    many = replace(model, cameras=model.cameras * 200)
+    with pytest.raises(TrainingError, match=r"expected at most 1 MB, got .* MB for \d+ cameras and the head"):
+        make_plan(many, BakeConfig(max_mb=1))
+
+
+@pytest.mark.parametrize(("machine", "memory"), [(2 << 30, 1.07), (4 << 30, 2.15), (64 << 30, 4.0)])
+def test_a_bake_takes_no_more_than_half_of_a_small_machine(
+    machine: int, memory: float, model: Model, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("player.files.memory.available_bytes", lambda: machine)
+    assert BakeConfig().memory == pytest.approx(memory, rel=0.01)
+    assert make_plan(model, BakeConfig(resolution=48)).n_bytes <= 1e9 * BakeConfig().memory
+    assert BakeConfig(max_memory=8).memory == 8
+
+
+@pytest.mark.parametrize(
+    ("given", "expected"),
+    [
+        ({"check_views": 0}, "check_views: expected 1 to 1,000, got 0"),
+        ({"check_views": 1001}, "check_views: expected 1 to 1,000, got 1001"),
+        ({"no_cull": True, "weight_floor": 0.01}, "weight_floor: expected none with --no-cull"),
+    ],
+)
+def test_settings_without_bound_or_effect_are_refused(given: dict[str, Any], expected: str) -> None:
+    with pytest.raises(ConfigError, match=expected):
+        BakeConfig(**given)
 
 
 def test_less_memory_means_fewer_rays(model: Model) -> None:
