@@ -119,8 +119,4 @@ export class Program {
       else gl[`uniform${{ [gl.FLOAT]: 1, [gl.FLOAT_VEC2]: 2, [gl.FLOAT_VEC3]: 3, [gl.FLOAT_VEC4]: 4 }[type]}fv`](place, [value].flat());
     }
   }
-
-  dispose() {
-    this.gl.deleteProgram(this.program);
-  }
 }

@@ -52,14 +52,11 @@ export class Renderer {
     const gl = canvas.getContext("webgl2", settings);
     if (!gl) throw new Error("WebGL2: expected a browser that has it switched on, got none");
     Object.assign(this, { canvas, gl, scene, onrestored: null });
-    this.listeners = {
-      webglcontextlost: (event) => event.preventDefault(), // otherwise the context would not come back
-      webglcontextrestored: () => {
-        this.setUp();
-        this.onrestored?.();
-      },
-    };
-    for (const [name, listener] of Object.entries(this.listeners)) canvas.addEventListener(name, listener);
+    canvas.addEventListener("webglcontextlost", (event) => event.preventDefault()); // otherwise it would not come back
+    canvas.addEventListener("webglcontextrestored", () => {
+      this.setUp();
+      this.onrestored?.();
+    });
     this.setUp();
   }
 
@@ -340,14 +337,5 @@ export class Renderer {
   async count(view) {
     const words = new Uint32Array((await this.read({ ...view, background: "transparent" }, undefined, true)).buffer);
     return { fetches: words.map((word) => word & 0xffffff), nHits: words.reduce((sum, word) => sum + (word >>> 24), 0) };
-  }
-
-  dispose() {
-    const { gl } = this;
-    for (const [name, listener] of Object.entries(this.listeners)) this.canvas.removeEventListener(name, listener);
-    this.forget();
-    for (const { texture } of Object.values(this.tables)) if (texture) gl.deleteTexture(texture);
-    for (const program of this.programs.values()) program.dispose();
-    for (const target of [this.found, this.colours, this.sum]) if (target) deleteFramebuffer(gl, target);
   }
 }

@@ -231,9 +231,7 @@ def test_a_renderer_waits_for_a_context_that_is_lost_while_its_shaders_are_compi
           const making = renderer.constructor.create(canvas, {{ ...scene, grid: null }});
           const [made] = await Promise.all([making, lostAndBack(canvas, async () => {{}})]);
           made.replace(scene);
-          const {{ rgba }} = await made.render(view);
-          made.dispose();
-          return [...rgba];
+          return [...(await made.render(view)).rgba];
         }}""",
         view_of(camera),
     )
