@@ -1,8 +1,8 @@
 """Tables of probabilities, in 4096ths, of the symbols in each context; contexts can share a table.
 
 A symbol is an integer from -63 to 63; the two ends stand for anything beyond as well. The context of a symbol
-is given by its neighbours' symbols (`context`), by a class that is known beforehand, and by the channel. A
-block has up to 64 tables, and every context names one of them.
+is given by its neighbours' symbols (`CONTEXT_OF_SUM`), by a class that is known beforehand, and by the
+channel. A block has up to 64 tables, and every context names one of them.
 """
 
 from __future__ import annotations
@@ -32,40 +32,18 @@ LEAN_STEPS = (1, 2, 4, 8)
 N_CONTEXTS = (len(SUM_STEPS) + 1) * (2 * len(LEAN_STEPS) + 1)
 
 N_MIXED = (3 * NEAR + 1) << 7
-"""Length of tables indexed by the sum of three `mixed` symbols and HALF, which is always below it."""
+"""Length of tables indexed by the sum of three numbers of MIXED and HALF, which is always below it."""
 HALF = 64
-"""Added to sums of `mixed` symbols, so that the bits from 7 on are the sum of the magnitudes."""
+"""Added to sums of MIXED, so that the bits from 7 on are the sum of the magnitudes."""
 
 TABLE_BITS = 48.0
 """Bits that the encoder assumes another table costs, besides a byte for each symbol in it."""
 
 
-def context(symbols: np.ndarray) -> np.ndarray:
-    """Return the context [n] for the symbols [3, n] of the neighbours, which are 0 where not known.
-
-    With each symbol s clipped to -15 ... 15, let M be the sum of |s| and L the sum of s. The context is
-    9 a + 4 + b. Here a is how many of `SUM_STEPS` are at most M; the magnitude of b is how many of
-    `LEAN_STEPS` are at most |L|, and its sign is that of L.
-
-    >>> context(np.array([[0, 1, 9, -63], [0, 0, 9, -1], [0, 0, -1, 1]])).tolist()
-    [4, 14, 71, 54]
-    """
-    near = np.clip(symbols, -NEAR, NEAR).astype(np.int64)
-    total, lean = np.abs(near).sum(axis=0), near.sum(axis=0)
-    side = np.sign(lean) * np.searchsorted(LEAN_STEPS, np.abs(lean), side="right")
-    return (
-        np.searchsorted(SUM_STEPS, total, side="right") * (2 * len(LEAN_STEPS) + 1) + side + len(LEAN_STEPS)
-    )
-
-
-def mixed(symbols: np.ndarray) -> np.ndarray:
-    """Return clipped symbols with their magnitudes in one int16, `128 |s| + s`, so that one sum adds both."""
-    near = np.clip(symbols, -NEAR, NEAR).astype(np.int16)
-    return (np.abs(near) << 7) + near
-
-
-MIXED = mixed(np.arange(-END, END + 1))
-"""[127] int16: `mixed` of each symbol, at the index symbol + 63."""
+_CLIPPED = np.clip(np.arange(-END, END + 1), -NEAR, NEAR).astype(np.int16)
+MIXED = (np.abs(_CLIPPED) << 7) + _CLIPPED
+"""[127] int16: `128 |s| + s` of each symbol s, clipped to -15 ... 15, at the index symbol + 63: one sum adds
+symbols and magnitudes."""
 
 
 def _contexts_of_sums() -> np.ndarray:
@@ -78,7 +56,12 @@ def _contexts_of_sums() -> np.ndarray:
 
 
 CONTEXT_OF_SUM = _contexts_of_sums()
-"""[N_MIXED] uint8: the context, at the index that is the sum of the neighbours' `mixed` symbols and 64."""
+"""[N_MIXED] uint8: the context, at the index that is 64 plus the sum of MIXED of the three neighbours'
+symbols, which are 0 where not known.
+
+With these symbols s, clipped, let M be the sum of |s| and L the sum of s. The context is 9 a + 4 + b. Here a
+is how many of `SUM_STEPS` are at most M; the magnitude of b is how many of `LEAN_STEPS` are at most |L|, and
+its sign is that of L."""
 
 
 class DecoderTables(NamedTuple):

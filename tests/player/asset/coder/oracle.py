@@ -8,6 +8,14 @@ import zlib
 from player.asset.coder.lanes import Neighbours
 
 
+def context(symbols: list[int]) -> int:
+    """Return the context for the symbols of the neighbours, which are 0 where not known."""
+    near = [max(-15, min(15, symbol)) for symbol in symbols]
+    total, lean = sum(map(abs, near)), sum(near)
+    side = sum(bound <= abs(lean) for bound in (1, 2, 4, 8)) * (1 if lean > 0 else -1)
+    return sum(bound <= total for bound in (1, 2, 3, 5, 8, 12, 18, 30)) * 9 + side + 4
+
+
 class Oracle:
     """Decoder of one section, symbol by symbol with Python's integers, written from `docs/format.md`."""
 
@@ -51,11 +59,8 @@ class Oracle:
         return [found[row] for row in range(self.n)]
 
     def symbol(self, lane: int, channel: int, row: int, classes: list[int], found: dict[int, int]) -> int:
-        near = [max(-15, min(15, found.get(rows[row], 0))) for rows in self.rows]
-        total, lean = sum(map(abs, near)), sum(near)
-        side = sum(bound <= abs(lean) for bound in (1, 2, 4, 8)) * (1 if lean > 0 else -1)
-        rise = sum(bound <= total for bound in (1, 2, 3, 5, 8, 12, 18, 30))
-        name = (channel * self.n_classes + classes[row]) * 81 + rise * 9 + side + 4
+        near = context([found.get(rows[row], 0) for rows in self.rows])
+        name = (channel * self.n_classes + classes[row]) * 81 + near
         places, counts = self.tables[self.named[name]]
         x = self.states[lane]
         symbol, place = places[x % 4096]

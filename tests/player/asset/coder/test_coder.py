@@ -23,13 +23,12 @@ from player.asset.coder.tables import (
     N_CONTEXTS,
     N_SYMBOLS,
     TOTAL,
-    context,
     fit_tables,
     unpack_tables,
 )
 from player.errors import FormatError, ShapeError
 from tests.numerics.bounds import Row
-from tests.player.asset.coder.oracle import Oracle
+from tests.player.asset.coder.oracle import Oracle, context
 
 CODER = "The entropy coder"
 ROUND_TRIP = Row(
@@ -187,8 +186,8 @@ def test_contexts_by_their_sums() -> None:
     random = np.random.default_rng(0)
     symbols = random.integers(-END, END + 1, (3, 10000)) // random.integers(1, 40, 10000)
     sums = MIXED[symbols + END].astype(int).sum(axis=0)
-    CONTEXTS.check(CONTEXT_OF_SUM[sums + 64], context(symbols))
-    assert context(np.full((3, 1), END)) == 80 and context(np.full((3, 1), -END)) == 72
+    CONTEXTS.check(CONTEXT_OF_SUM[sums + 64], [context(near) for near in symbols.T.tolist()])
+    assert context([END] * 3) == 80 and context([-END] * 3) == 72
 
 
 def test_tables_cost_what_they_say() -> None:

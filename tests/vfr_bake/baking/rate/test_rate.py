@@ -7,11 +7,12 @@ from itertools import pairwise, product
 import numpy as np
 import pytest
 
-from player.asset.coder.tables import CONTEXT_OF_SUM, MIXED, context
+from player.asset.coder.tables import CONTEXT_OF_SUM, MIXED
 from player.asset.parts import LIMITS
 from player.asset.pyramid import Bricks, Pyramid, places_between, symbols_of, values_of
 from player.asset.sections import Grid
 from player.asset.symbols import encode_level, level_rows
+from tests.player.asset.coder.oracle import context
 from vfr_bake.baking import bake
 from vfr_bake.baking.coarser_levels import pyramid_beneath
 from vfr_bake.baking.detail.shown import Wanted, mean_values
@@ -112,7 +113,7 @@ def test_symbols_are_chosen_one_after_the_other(step: int) -> None:
     )  # fmt: skip
     symbols, total_distortion, total_rate, counts = np.zeros(n + 1, int), 0.0, 0.0, np.zeros(bits.shape, int)
     for v in range(n):
-        at = int(classes[v]) * 81 + int(context(symbols[neighbours[:, v]][:, None])[0])
+        at = int(classes[v]) * 81 + context(symbols[neighbours[:, v]].tolist())
         nearest = int(np.rint((wanted[v] - predicted[v]) / np.float32(step)))
         tried = {0, nearest, nearest - int(np.sign(nearest))}
         costs = {}
