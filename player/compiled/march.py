@@ -55,7 +55,7 @@ class Work(NamedTuple):
     masses: np.ndarray
     """[LANES] float32: opacities, 0 where nothing is fetched."""
     into: np.ndarray
-    """[LANES] int64: the row of `MarchOutputs.features` that each ray's fetches are added to."""
+    """[LANES] int64: the row of the found features that each ray's fetches are added to."""
     places: np.ndarray
     """[3, LANES] float32: the position of one fetch of each ray, in cells of the densities' grid."""
     weights: np.ndarray
@@ -64,18 +64,6 @@ class Work(NamedTuple):
     """[8, LANES] int32: rows of the features at the eight corners around the places."""
     shares: np.ndarray
     """[9, LANES] float32: shares of these rows, as `stored_corners` finds them."""
-
-
-class MarchOutputs(NamedTuple):
-    """The results for n rays. `player.march.march.MarchResult` gets the first rows of the last two arrays."""
-
-    opacity: np.ndarray
-    depth: np.ndarray
-    n_density_samples: np.ndarray
-    hits: np.ndarray
-    """[n] int64."""
-    features: np.ndarray
-    """[n, n_channels rounded up to a multiple of CHANNELS] float32."""
 
 
 def march(
@@ -102,7 +90,7 @@ def march(
         rows=scratch((8, LANES), np.int32),
         shares=scratch((9, LANES), F32),
     )
-    found = MarchOutputs(
+    found = MarchResult(  # with room for n_rays hits, and for features in whole registers
         opacity=scratch(n_rays, F32, 0),
         depth=scratch(n_rays, F32, 0),
         n_density_samples=scratch(n_rays, np.int32, 0),
