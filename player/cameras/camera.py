@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from player.errors import FormatError
+from player.files.json_files import brief
 
 
 @dataclass(frozen=True)
@@ -43,8 +44,7 @@ class Camera:
             try:
                 converted = convert(value)
             except (TypeError, ValueError, OverflowError):
-                got = " ".join(repr(value).split())[:80]
-                raise FormatError(f"{self.name}: {key}: expected {expected}, got {got}") from None
+                raise FormatError(f"{self.name}: {key}: expected {expected}, got {brief(value)}") from None
             object.__setattr__(self, key, converted)
         check_pose(self.c2w, self.name)
         if self.width < 1 or self.height < 1:

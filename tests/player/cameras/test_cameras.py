@@ -92,7 +92,7 @@ def test_a_camera_keeps_copies_and_plain_numbers():
         ({"c2w": None}, "a: camera matrix: expected 4 rows of 4 numbers, got shape"),
         ({"width": 7.5}, "a: width: expected a whole number, got 7.5"),
         ({"height": float("nan")}, "a: height: expected a whole number, got nan"),
-        ({"fx": "wide"}, "a: fx: expected a number, got 'wide'"),
+        ({"fx": "wide"}, "a: fx: expected a number, got wide"),
         ({"cx": None}, "a: cx: expected a number, got None"),
     ],
 )
