@@ -105,20 +105,22 @@ def fit_cells(cells: np.ndarray, resolutions: Resolutions, most: int) -> FittedC
         if finest >= len(cells):
             densities = resolutions.densities * finest // resolutions.features
             return FittedCells(cells, Resolutions(densities, finest), int(n * (finest / len(cells)) ** 3))
-        cells = _halved(cells)
+        cells = _overlapping(cells, -(-len(cells) // 2))
 
 
-def _halved(cells: np.ndarray) -> np.ndarray:
-    """Halve the resolution of `cells` [n, n, n] bool, rounded up: a coarse cell is marked if it overlaps a
-    marked one."""
-    n, half = len(cells), -(-len(cells) // 2)
-    first = np.arange(half) * n // half
-    last = -(-(np.arange(half) + 1) * n // half)
+def _overlapping(cells: np.ndarray, resolution: int) -> np.ndarray:
+    """Resample `cells` [n, n, n] bool to a grid of `resolution` over the same box: a cell is marked if it
+    overlaps a marked one.
+
+    >>> _overlapping(np.array([True, False, False]).reshape(3, 1, 1).repeat(3, 1).repeat(3, 2), 2)[:, 0, 0]
+    array([ True, False])
+    """
+    n = len(cells)
+    first = np.arange(resolution) * n // resolution
+    last = (np.arange(1, resolution + 1) * n - 1) // resolution
     for axis in range(3):
-        reached = [
-            cells.take(np.minimum(first + k, last - 1), axis) for k in range(int((last - first).max()))
-        ]
-        cells = np.logical_or.reduce(reached)
+        parts = [cells.take(np.minimum(first + i, last), axis) for i in range(max(last - first) + 1)]
+        cells = np.logical_or.reduce(parts)
     return cells
 
 
@@ -249,14 +251,7 @@ def marked_cells(
 def occupied_cells(model: Model, resolution: int) -> np.ndarray:
     """Return [resolution]^3 bool: the cells that overlap an occupied cell of the training's occupancy
     grid."""
-    cells = model.occupancy.occupied
-    n = len(cells)
-    first = np.arange(resolution) * n // resolution
-    last = (np.arange(1, resolution + 1) * n - 1) // resolution
-    for axis in range(3):
-        parts = [cells.take(np.minimum(first + i, last), axis) for i in range(max(last - first) + 1)]
-        cells = np.logical_or.reduce(parts)
-    return cells
+    return _overlapping(model.occupancy.occupied, resolution)
 
 
 def pixel_footprints(model: Model, least_distance: float = 1e-6) -> np.ndarray:

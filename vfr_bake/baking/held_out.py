@@ -25,6 +25,7 @@ import numpy as np
 from player.asset.grid import SparseGrid
 from player.cameras.camera import Camera, focus_point
 from player.cameras.keyframes import camera_on_path
+from player.cameras.rotations import rotation_matrix
 from player.errors import TrainingError
 from player.march.march import MIN_OPACITY, MarchResult
 from player.render import choose_march
@@ -95,7 +96,8 @@ def views_between(model: Model, n_views: int, seed: int, wide: bool = False) -> 
         angle = float(np.arccos(np.clip(sides[index] @ sides[other], -1, 1)))
         share = min(random.uniform(0.25, 0.5), LARGEST_TURN / max(angle, 1e-9))
         axis = random.normal(size=3)
-        turn = _turn(axis / np.linalg.norm(axis), min(angle, LARGEST_TURN) / 4 * random.uniform(0.5, 1))
+        half = min(angle, LARGEST_TURN) / 8 * random.uniform(0.5, 1)
+        turn = rotation_matrix(np.array([np.cos(half), *(np.sin(half) * axis / np.linalg.norm(axis))]))
         move = np.eye(4)
         move[:3, :3] = turn
         move[:3, 3] = focus - turn @ focus
@@ -106,13 +108,6 @@ def views_between(model: Model, n_views: int, seed: int, wide: bool = False) -> 
             move[:3, 3] += aside * np.linalg.norm(places[other] - places[index])
         found.append(replace(camera, name=f"{camera.name} turned", c2w=move @ camera.c2w))
     return [widened(camera) for camera in found] if wide else found
-
-
-def _turn(axis: np.ndarray, angle: float) -> np.ndarray:
-    """Return the rotation [3, 3] by `angle` around the unit vector `axis` (Rodrigues)."""
-    x, y, z = axis
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
 
 
 def widened(camera: Camera) -> Camera:
