@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Iterable
 from typing import Any
 
@@ -112,10 +111,14 @@ class Adam:
                 tensor.copy_(of_state)
 
 
-class TableAdam(ABC):
-    """Adam for a hash table [n_entries, n_channels]. Others add to the table's gradient until the step."""
+class DeviceGridAdam(Adam):
+    """torch's Adam for a hash table on a GPU, whose memory is fast enough to step all entries.
+
+    Unlike with `GridAdam`, entries without a gradient therefore keep moving by their momentum for some steps.
+    """
 
     def __init__(self, table: Tensor) -> None:
+        super().__init__([table], GRID_BETAS, EPSILON)
         self.table = table
 
     @property
@@ -124,61 +127,35 @@ class TableAdam(ABC):
         assert self.table.grad is not None
         return self.table.grad
 
-    @abstractmethod
     def step(self, rate: float) -> None:
-        """Take one step along the gradient, and clear it."""
-
-    @abstractmethod
-    def clear(self) -> None:
-        """Clear the gradient without taking a step."""
-
-    @abstractmethod
-    def state(self) -> dict[str, Any]:
-        """Return all that later steps depend on, as tensors and plain values."""
-
-    @abstractmethod
-    def restore(self, state: dict[str, Any]) -> None:
-        """Continue from what `state` returned."""
-
-
-class DeviceGridAdam(TableAdam):
-    """torch's Adam for a hash table on a GPU, whose memory is fast enough to step all entries.
-
-    Unlike with `GridAdam`, entries without a gradient therefore keep moving by their momentum for some steps.
-    """
-
-    def __init__(self, table: Tensor) -> None:
-        super().__init__(table)
-        self._adam = Adam([table], GRID_BETAS, EPSILON)
-
-    def step(self, rate: float) -> None:
-        self._adam.step(rate)
+        """Take one step along the gradient, and drop it."""
+        super().step(rate)
         self.clear()
 
-    def clear(self) -> None:
-        self.table.grad = None
 
-    def state(self) -> dict[str, Any]:
-        return self._adam.state()
-
-    def restore(self, state: dict[str, Any]) -> None:
-        self._adam.restore(state)
-
-
-class GridAdam(TableAdam):
-    """Adam for a hash table whose gradient is mostly zero; it owns the buffer of the gradient."""
+class GridAdam:
+    """Adam for a hash table [n_entries, n_channels] whose gradient is mostly zero; it owns the buffer of the
+    gradient."""
 
     def __init__(self, table: Tensor) -> None:
-        super().__init__(table)
+        self.table = table
         table.grad = zeros(*table.shape)
         self.moments = zeros(len(table), 2 * table.shape[1])
         self.n_steps = 0
 
+    @property
+    def gradient(self) -> Tensor:
+        """[n_entries, n_channels]: the gradient for the next step."""
+        assert self.table.grad is not None
+        return self.table.grad
+
     def step(self, rate: float) -> None:
+        """Take one step along the gradient, and clear it."""
         arrays = (a.numpy() for a in (self.table.detach(), self.gradient, self.moments))
         adam_step(*arrays, self._next_rates(rate))
 
     def clear(self) -> None:
+        """Clear the gradient without taking a step."""
         self.gradient.zero_()
 
     def _next_rates(self, rate: float) -> AdamRates:
@@ -189,9 +166,11 @@ class GridAdam(TableAdam):
         return AdamRates(*map(np.float32, (rate * correction, beta1, beta2, EPSILON)))
 
     def state(self) -> dict[str, Any]:
+        """Return all that later steps depend on, as tensors and plain values."""
         return {"moments": self.moments, "n_steps": self.n_steps}
 
     def restore(self, state: dict[str, Any]) -> None:
+        """Continue from what `state` returned."""
         self.moments.copy_(state["moments"])
         self.n_steps = state["n_steps"]
 
@@ -229,3 +208,7 @@ class FusedGridAdam(GridAdam):
 
     def clear(self) -> None:
         self._pending.clear()
+
+
+TableAdam = GridAdam | DeviceGridAdam
+"""Adam for a hash table. Others add to the table's gradient until the step."""
