@@ -49,7 +49,8 @@ def fuse_depth(views: list[DepthView], voxel: float, progress: Progress = silent
     grid = open3d.t.geometry.VoxelBlockGrid(
         ("tsdf", "weight"), (core.float32, core.float32), (1, 1), voxel, 8, _BLOCKS, core.Device("CPU:0")
     )
-    middle = np.mean([view.camera.c2w[:3, 3] for view in views], axis=0)
+    # Moved by whole voxels, so that the lattice, and with it the surface, does not depend on the cameras.
+    middle = np.round(np.mean([view.camera.c2w[:3, 3] for view in views], axis=0) / voxel) * voxel
     for done, view in enumerate(views, start=1):
         camera = view.camera
         depth = reliable_depth(view, JUMP * voxel)
