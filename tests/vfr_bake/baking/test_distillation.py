@@ -122,7 +122,9 @@ def test_an_asset_shows_what_the_photographs_show(model: Model, tmp_path: Path) 
     )
     config = BakeConfig(resolution=48, feature_resolution=32, mesh_resolution=16, refine_steps=200)
     result = bake(other, tmp_path / "asset", replace(config, check_views=1), lambda stage, done, of: None)
-    assert result.loss.db < -1.5, "it shows less error than the model does"
+    # It gains 0.9 or 2.5 dB, by the number of threads that trained the model; of the former 0.2 dB without
+    # learning from these photographs.
+    assert result.loss.db < -0.5, "it shows less error than the model does"
     with Renderer(Asset.open(tmp_path / "asset")) as renderer:
         played = renderer.render(asset_cameras(renderer.asset)[0], background=(0.0, 0.0, 0.0)).rgb
     shown = render_image(model.field, model.sampler, model.model_cameras()[0], np.zeros(3))

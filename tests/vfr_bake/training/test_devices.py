@@ -48,8 +48,10 @@ def test_torch_learns_what_numba_learns(kind: str, device: torch.device) -> None
     before = psnr(ours, scene)
     losses = [[report.loss for report in trainer.run()] for trainer in (ours, expected)]
     assert ours.n_bad_steps == 0 and len(losses[0]) == settings["steps"]
-    if device.type == "cpu":  # one generator: the same rays
-        np.testing.assert_allclose(losses[0][:20], losses[1][:20], rtol=0.02)
+    if device.type == "cpu":
+        # One generator: the same rays. Sums in another order, as of several threads, differ by 1e-5 in the
+        # first steps and by a few per cent after ten.
+        np.testing.assert_allclose(losses[0][:8], losses[1][:8], rtol=0.005)
     assert psnr(ours, scene) == pytest.approx(psnr(expected, scene), abs=1.0)
     assert psnr(ours, scene) > before + (3 if kind == "object" else 0.5)
 
