@@ -4,6 +4,7 @@ character (upper half blocks), if the terminal has 16 million colours."""
 from __future__ import annotations
 
 import os
+import shlex
 from typing import TYPE_CHECKING, TextIO
 
 if TYPE_CHECKING:  # imported before `--help` is answered, which needs no numpy
@@ -13,6 +14,17 @@ if TYPE_CHECKING:  # imported before `--help` is answered, which needs no numpy
 
 ROWS = 16
 """Lines of the picture on the `--info` page."""
+
+
+def command_line(*words: str) -> str:
+    """Return the words as a command that can be pasted into this system's shell.
+
+    >>> command_line("vfr-play", "out", "--info")
+    'vfr-play out --info'
+    """
+    if os.name == "nt":  # whose shells know double quotes alone; a path with backslashes needs none
+        return " ".join(f'"{word}"' if " " in word else word for word in words)
+    return shlex.join(words)
 
 
 def printable(text: str) -> str:

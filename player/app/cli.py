@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import shlex
 import sys
 import threading
 from dataclasses import replace
@@ -17,7 +16,7 @@ from player.app.option_types import DEMO
 from player.app.options import PlaySettings, given, parse, settings_of
 from player.errors import ConfigError, FormatError, VfrError
 from player.progress import Bar, duration
-from player.terminal import picture_lines, printable
+from player.terminal import command_line, picture_lines, printable
 
 if TYPE_CHECKING:  # `--help` answers without numpy
     from player.app.frame_files import Target
@@ -101,8 +100,8 @@ def _advise(asset: Path, address: str) -> None:
     if not _has_display():
         port = address.rpartition(":")[2]
         _say(f"no display here: from a machine that has one, ssh -L {port}:127.0.0.1:{port} to this")
-        name = shlex.quote(str(asset))
-        _say(f"and open that address there; or render files: vfr-play {name} --orbit 60 --output frames/")
+        files = command_line("vfr-play", str(asset), "--orbit", "60", "--output", "frames/")
+        _say(f"and open that address there; or render files: {files}")
 
 
 def _has_display() -> bool:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shlex
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -17,7 +16,7 @@ from player.asset.pyramid import PyramidValues
 from player.cameras.views import asset_cameras
 from player.head.head import asset_head
 from player.march.contracted import MAX_SPEED
-from player.terminal import printable
+from player.terminal import command_line, printable
 
 MANIFEST_KEYS = (
     "version", "generator", "resolution", "feature_resolution", "aabb", "world_from_model", "contracted",
@@ -101,10 +100,10 @@ def page(folder: Path, m: Manifest, known: dict[str, Any]) -> list[str]:
         ]),
     ]  # fmt: skip
     lines += _section("provenance", list(_flat(m.provenance)))
-    name = shlex.quote(str(folder))
+    command = command_line("vfr-play", str(folder))
     lines += _section("to look at it", [
-        ("in a browser", f"vfr-play {name}"),
-        ("pictures", f"vfr-play {name} --orbit 60 --output frames/"),
+        ("in a browser", command),
+        ("pictures", f"{command} --orbit 60 --output frames/"),
     ])  # fmt: skip
     return [printable(line) for line in lines]
 

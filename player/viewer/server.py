@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import os
-import shlex
 import socket
 import threading
 import warnings
@@ -22,7 +21,7 @@ from player.cameras.camera import focus_point, orbit, world_up
 from player.cameras.views import asset_cameras
 from player.errors import ConfigError, MissingExtraError
 from player.render import Background, March, Quality, Renderer
-from player.terminal import printable
+from player.terminal import command_line, printable
 from player.viewer.growing import Growing, tell_what_is_missing
 from player.viewer.pages import NO_PAGES, Pages
 from player.viewer.window import PictureChoices, Window
@@ -223,9 +222,10 @@ def _need_viser(asset: Asset) -> None:
     try:
         import viser  # noqa: F401
     except ImportError as error:
+        files = command_line("vfr-play", str(asset.folder), "--orbit", "60", "--output", "frames/")
         raise MissingExtraError(
             "viewer: expected the package viser, which is not installed: pip install 'vfr-bake[viewer]'; "
-            f"or render files: vfr-play {shlex.quote(str(asset.folder))} --orbit 60 --output frames/"
+            f"or render files: {files}"
         ) from error
 
 

@@ -12,7 +12,7 @@ import pytest
 from player.asset.asset import Asset
 from player.cameras.transforms import read_cameras
 from player.render import render
-from player.terminal import ROWS, half_blocks, picture_lines
+from player.terminal import ROWS, command_line, half_blocks, picture_lines
 
 
 class Terminal(io.StringIO):
@@ -63,3 +63,12 @@ def test_no_picture_where_it_cannot_be_shown(
     if lacks == "letters":
         monkeypatch.setattr(Terminal, "encoding", "latin-1")
     assert picture_lines(asset, stream) == []
+
+
+@pytest.mark.parametrize(
+    ("system", "shown"),
+    [("posix", r"vfr-play 'my scenes\out' --info"), ("nt", r'vfr-play "my scenes\out" --info')],
+)
+def test_a_command_can_be_pasted(system: str, shown: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "name", system)
+    assert command_line("vfr-play", r"my scenes\out", "--info") == shown

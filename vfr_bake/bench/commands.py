@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import shlex
 from typing import Any
 
 from player.asset.asset import Asset
 from player.march.interpolation import Quality
+from player.terminal import command_line
 from vfr_bake.config import BakeConfig
 from vfr_bake.presets import PRESETS
 
@@ -39,7 +39,7 @@ def bake_command(folder: str, asset: Asset) -> str:
                for word in (f"--{name.replace('_', '-')}", f"{value:g}")]  # fmt: skip
     if settings.get("no_cull"):
         options.append("--no-cull")
-    return shlex.join(["vfr-bake", "model.pt", folder, "--preset", preset, *options])
+    return command_line("vfr-bake", "model.pt", folder, "--preset", preset, *options)
 
 
 def play_command(folder: str, samples: int, quality: Quality, size: tuple[int, int]) -> str:
@@ -51,4 +51,4 @@ def play_command(folder: str, samples: int, quality: Quality, size: tuple[int, i
     width, height = size
     dials = ["--samples", str(samples), *([] if quality == "exact" else ["--quality", quality])]
     views = ["--size", f"{width}x{height}", "--orbit", "60", "--output", "frames/"]
-    return shlex.join(["vfr-play", folder, *dials, *views])
+    return command_line("vfr-play", folder, *dials, *views)

@@ -9,7 +9,6 @@ the assets, fewer views are compared.
 
 from __future__ import annotations
 
-import shlex
 import tempfile
 import time
 from contextlib import ExitStack
@@ -25,6 +24,7 @@ from player.cameras.transforms import read_cameras, write_cameras
 from player.errors import ConfigError
 from player.march.interpolation import Quality
 from player.progress import Report
+from player.terminal import command_line
 from player.threads import bounded_threads
 from vfr_bake.baking.report import Pictures
 from vfr_bake.bench.commands import bake_command, play_command
@@ -236,7 +236,7 @@ class _Run:
             n_bytes=path.stat().st_size,
             peak_mb=answers[sizes[0]][-1]["peak_mb"],
             first_picture_ms=None,
-            commands=(shlex.join(["vfr-eval", str(path), data]),),
+            commands=(command_line("vfr-eval", str(path), data),),
         )
         return setting, pictures, lines
 
