@@ -74,10 +74,11 @@ class Frame:
     """[h, w, n_channels] float32, the input of the head (in units of the codes), 0 where it was not run; None
     unless asked for with `layers`."""
     find_normals: Callable[[], np.ndarray] | None = None
-    """Function that computes `normals`; None in a copy that was pickled."""
+    """Function that computes `normals`; None in a frame that was copied or pickled."""
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return what is pickled: normals that are already computed, but not the grid that others need."""
+        """Return what is copied or pickled: normals, if they are already computed, but not the grid that they
+        need otherwise."""
         return vars(self) | {"find_normals": None}
 
     @cached_property
@@ -85,13 +86,13 @@ class Frame:
         """[h, w, 3] float32, WORLD frame, of unit length or 0 (`player.march.normals`).
 
         They are computed when they are first asked for, at the cost of a second march, unless the frame was
-        rendered with `layers`. Raises ConfigError for a frame that was not made by a renderer, or was pickled
-        before they were computed.
+        rendered with `layers`. Raises ConfigError for a frame that was not made by a renderer, or was
+        copied or pickled before they were computed.
         """
         if self.find_normals is None:
             raise ConfigError(
-                "normals: expected the frame of a renderer, got one that was put together, or was pickled "
-                "without them: render with layers=True"
+                "normals: expected the frame of a renderer, got one that was put together, copied or "
+                "pickled without them: render with layers=True"
             )
         return self.find_normals()
 

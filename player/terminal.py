@@ -4,6 +4,7 @@ character (upper half blocks), if the terminal has 16 million colours."""
 from __future__ import annotations
 
 import os
+import re
 import shlex
 from typing import TYPE_CHECKING, TextIO
 
@@ -23,7 +24,7 @@ def command_line(*words: str) -> str:
     'vfr-play out --info'
     """
     if os.name == "nt":  # whose shells know double quotes alone; a path with backslashes needs none
-        return " ".join(f'"{word}"' if " " in word else word for word in words)
+        return " ".join(word if re.fullmatch(r"[\w\\/:.,=+-]+", word) else f'"{word}"' for word in words)
     return shlex.join(words)
 
 

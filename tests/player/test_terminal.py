@@ -67,8 +67,11 @@ def test_no_picture_where_it_cannot_be_shown(
 
 @pytest.mark.parametrize(
     ("system", "shown"),
-    [("posix", r"vfr-play 'my scenes\out' --info"), ("nt", r'vfr-play "my scenes\out" --info')],
+    [
+        ("posix", r"vfr-play 'C:\R&D\my out' 'D:\out' --info"),
+        ("nt", r'vfr-play "C:\R&D\my out" D:\out --info'),
+    ],
 )
 def test_a_command_can_be_pasted(system: str, shown: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "name", system)
-    assert command_line("vfr-play", r"my scenes\out", "--info") == shown
+    assert command_line("vfr-play", r"C:\R&D\my out", r"D:\out", "--info") == shown

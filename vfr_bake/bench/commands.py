@@ -45,8 +45,8 @@ def bake_command(folder: str, asset: Asset) -> str:
 def play_command(folder: str, samples: int, quality: Quality, size: tuple[int, int]) -> str:
     """Return the command that plays an asset with k = `samples`.
 
-    >>> play_command("my out", 5, "fast", (400, 300))
-    "vfr-play 'my out' --samples 5 --quality fast --size 400x300 --orbit 60 --output frames/"
+    >>> play_command("out", 5, "fast", (400, 300))
+    'vfr-play out --samples 5 --quality fast --size 400x300 --orbit 60 --output frames/'
     """
     width, height = size
     dials = ["--samples", str(samples), *([] if quality == "exact" else ["--quality", quality])]

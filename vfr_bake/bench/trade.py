@@ -20,7 +20,8 @@ import numpy as np
 
 from player.asset.asset import Asset
 from player.cameras.camera import Camera
-from player.cameras.transforms import read_cameras, write_cameras
+from player.cameras.transforms import write_cameras
+from player.cameras.views import asset_cameras
 from player.errors import ConfigError
 from player.march.interpolation import Quality
 from player.progress import Report
@@ -346,10 +347,7 @@ def _read_views(config: BenchConfig, assets: list[Asset], progress: Report) -> t
     train = assets[0].manifest.provenance.get("train", {})
     scene = load_scene_as(train, config.data, lambda done, of: progress("reading pictures", done, of))
     exposure = any(_exposure_learned(asset.manifest.provenance) for asset in assets)
-    learned = [
-        Learned(str(asset.folder), read_cameras(asset.path("cameras.json")), asset.world_from_model)
-        for asset in assets
-    ]
+    learned = [Learned(str(asset.folder), asset_cameras(asset), asset.world_from_model) for asset in assets]
     if config.model is not None:
         model = load_model(config.model, config.max_memory)
         learned.append(Learned(str(config.model), model.cameras, model.world_from_model))

@@ -122,7 +122,7 @@ def test_an_exposure_needs_both_halves(columns: slice, scene: Scene) -> None:
 
 def test_as_many_views_are_scored_as_there_is_time_for(scene: Scene, model: Model) -> None:
     told = []
-    (first,), lines = quick_psnr(model, scene, 3, 0.0, lambda *counts: told.append(counts))
+    (first,), lines = quick_psnr(model, scene, 3, -1.0, lambda *counts: told.append(counts))
     assert told == [(1, 3)] and len(lines) == 1 and lines[0].startswith("scored 1 of 3 test views, because ")
     every = [view.score().psnr for view in render_views(model, scene.test)]
     assert first == every[0]
