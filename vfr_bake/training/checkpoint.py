@@ -2,28 +2,36 @@
 file until that is written.
 
 Keys: format "vfr-checkpoint", version [major, minor], settings (of the run), pictures (names of the training
-views), cameras ([n_views, 22], poses and intrinsics of these views), state (`Trainer.state`). It holds
-tensors and plain values only, and loads with `weights_only=True`.
+views), cameras ([n_views, 22], poses and intrinsics of these views), background (`Trainer.background` as a
+list; white in version 1.6, which does not have it), state (`Trainer.state`). It holds tensors and plain
+values only, and loads with `weights_only=True`.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 
+import numpy as np
 import torch
 
 from player.errors import ConfigError, FormatError
+from vfr_bake.data.scene import WHITE
 from vfr_bake.training.tensor_files import read_tensors, write_tensors
 from vfr_bake.training.trainer import Trainer
 
 FORMAT = "vfr-checkpoint"
-VERSION = [1, 6]
+VERSION = [1, 7]
+READABLE = ([1, 6], VERSION)
+"""Versions that are read."""
 LENGTH_SETTINGS = {"effort", "steps", "minutes", "eval_views", "checkpoint_minutes"}
 """Settings that may differ between the run that was interrupted and the one that continues it."""
 NO_LIMIT = 1e8
 """Gigabytes of memory that reading may take: training has held all of it, and goes on with it."""
 SAME = 1e-4
 """Largest difference between numbers of cameras that count as the same: processors round differently."""
+SAME_LEVEL = 2.5 / 255
+"""Largest difference between backgrounds that count as the same: decoders of pictures round differently."""
 
 
 def checkpoint_path(model: Path) -> Path:
@@ -43,6 +51,7 @@ def save_checkpoint(path: Path, trainer: Trainer) -> None:
         "settings": trainer.settings,
         "pictures": [camera.name for camera in trainer.cameras],
         "cameras": _numbers(trainer),
+        "background": None if trainer.background is None else trainer.background.tolist(),
         "state": trainer.state(),
     }
     write_tensors(path, content)
@@ -52,10 +61,11 @@ def load_checkpoint(path: Path, trainer: Trainer) -> None:
     """Restore the state of `trainer` from a checkpoint.
 
     Raises FormatError (not a checkpoint, or cut short) or ConfigError (the checkpoint is of a run with other
-    settings or other pictures).
+    settings, other pictures or another background).
     """
     content = read_tensors(path, "a checkpoint written by vfr-train", NO_LIMIT)
-    if not isinstance(content, dict) or content.get("format") != FORMAT or content.get("version") != VERSION:
+    is_ours = isinstance(content, dict) and content.get("format") == FORMAT
+    if not is_ours or content.get("version") not in READABLE:
         raise FormatError(
             f"{path}: expected a checkpoint of this version of vfr-train: train without --resume"
         )
@@ -71,7 +81,9 @@ def load_checkpoint(path: Path, trainer: Trainer) -> None:
         same = content["pictures"] == names and torch.allclose(
             content["cameras"], _numbers(trainer), rtol=0, atol=SAME
         )
-        if same:
+        before, behind = content.get("background", WHITE), trainer.background
+        same_behind = behind is None or np.allclose(before, behind, rtol=0, atol=SAME_LEVEL)
+        if same and same_behind:
             trainer.restore(content["state"])
     except (KeyError, TypeError, ValueError, RuntimeError) as error:
         raise FormatError(f"{path}: state: does not fit this data set: {error}") from error
@@ -80,6 +92,15 @@ def load_checkpoint(path: Path, trainer: Trainer) -> None:
             f"{path}: pictures: expected those of the interrupted run with their cameras, got others: name "
             "that data set, or train without --resume"
         )
+    if behind is not None and not same_behind:
+        raise ConfigError(
+            f"{path}: background: expected {_shown(before)} as in the interrupted run, got "
+            f"{_shown(behind)}: train without --resume"
+        )
+
+
+def _shown(colour: Iterable[float]) -> str:
+    return "rgb(" + ", ".join(f"{255 * level:.0f}" for level in colour) + ")"
 
 
 def _numbers(trainer: Trainer) -> torch.Tensor:

@@ -122,7 +122,8 @@ class Trainer:
         self._random_background = scene.has_alpha or scene.unbounded
         self._views = scene.train
         self._masked = scene.masked
-        self._background = None if scene.unbounded and not scene.has_alpha else np.array(scene.background)
+        self.background = None if scene.unbounded and not scene.has_alpha else np.array(scene.background)
+        """[3] What is behind the pictures, sRGB in [0, 1]; None if nothing is seen through them."""
         # Not without alpha: there, only plain pixels of the background show that space is empty. Not on a
         # GPU: its batches are so large that they have enough detail anyway.
         self._by_detail = scene.has_alpha and self.device.type == "cpu"
@@ -249,7 +250,7 @@ class Trainer:
 
     def _measured(self) -> tuple[WitnessLoss, np.ndarray]:
         if self._probe is None:
-            self._probe = WitnessErrors(self.witnesses, self._views.cameras, self._background)
+            self._probe = WitnessErrors(self.witnesses, self._views.cameras, self.background)
         return self._probe.loss, self._probe.errors(self.field, self.sampler)
 
     def witness_psnr(self) -> WitnessPsnr | None:
@@ -338,7 +339,7 @@ class Trainer:
         if self._random_background:
             background = torch.rand(n_rays, 3, generator=self._generator, device=self.device)
         else:
-            background = torch.tensor(self._background, device=self.device).float().repeat(n_rays, 1)
+            background = torch.tensor(self.background, device=self.device).float().repeat(n_rays, 1)
         chances = torch.rand(n_rays, generator=self._generator, device=self.device)
         share = self.processes.share
         return Batch(*(share(rows) for rows in (*vars(rays).values(), jitter, background, chances)))

@@ -297,6 +297,22 @@ def test_a_checkpoint_of_another_run_is_refused(scene: Scene, tmp_path: Path) ->
             load_checkpoint(tmp_path / "c", trainer)
 
 
+def test_a_checkpoint_of_another_background_is_refused(scene: Scene, tmp_path: Path) -> None:
+    """Versions before 1.7 trained objects over white, and go on if that is still the background."""
+    over_black = replace(scene, background=(0.0, 0.0, 0.0))
+    save_checkpoint(tmp_path / "c", Trainer(over_black, config(steps=3)))
+    load_checkpoint(tmp_path / "c", Trainer(replace(scene, background=(1 / 255, 0.0, 0.0)), config(steps=3)))
+    expected = r"background: expected rgb\(0, 0, 0\) as in the interrupted run, got rgb\(255, 255, 255\)"
+    with pytest.raises(ConfigError, match=expected):
+        load_checkpoint(tmp_path / "c", Trainer(scene, config(steps=3)))
+    content = torch.load(tmp_path / "c", weights_only=True)
+    del content["background"]
+    torch.save(content | {"version": [1, 6]}, tmp_path / "c")
+    load_checkpoint(tmp_path / "c", Trainer(scene, config(steps=3)))
+    with pytest.raises(ConfigError, match=r"background: expected rgb\(255, 255, 255\)"):
+        load_checkpoint(tmp_path / "c", Trainer(over_black, config(steps=3)))
+
+
 def test_colours_can_be_composited_instead(scene: Scene) -> None:
     """Composited colours (equation 2, the paper's baseline) learn the same scene, without a pilot."""
     colour = config(steps=150, field=FieldOptions(**vars(FIELD) | {"compositing": "colour"}))
