@@ -55,6 +55,15 @@ _ADVICE_OF_MANY_FILES = (
     "http://localhost:8000/. Or export the scene as one file, whose name ends in .html. On a server, the "
     "folder's address must end in a slash, and files that end in .js must be sent as text/javascript."
 )
+# Inline, because a page on a disk may load no script. It waits for the error event and not for a time, so
+# that a slow line is not taken for a script that cannot run; it comes before the element, to miss no event.
+_WATCH = """\
+addEventListener("error", ({ target }) => {
+  if (target.id !== "script") return;
+  document.body.classList.add("failed");
+  document.getElementById("status").textContent = document.querySelector("noscript").textContent;
+}, true);
+"""
 MAX_GPU_MB = 512
 """Megabytes of graphics memory that a page may take, unless more are allowed."""
 _POLICY = (
@@ -146,14 +155,16 @@ def page_of_many_files(asset: Asset, title: str | None = None, max_gpu_mb: int =
     """
     n_gpu = _checked_gpu_bytes(asset, max_gpu_mb)
     sources = {name: text for name, text in web_files().items() if name != BOOT}
-    policy = _POLICY.format(script="'self'", style="'self'", img="'self'", worker="'self'", connect="'self'")
+    policy = _POLICY.format(
+        script=f"'self' {_hash(_WATCH)}", style="'self'", img="'self'", worker="'self'", connect="'self'"
+    )
     filled = {
         "policy": _policy_element(policy),
         "title": _title(asset, title),
         "style": f'<link rel="stylesheet" href="{STYLE}">',
         "poster": POSTER,
         "advice": _ADVICE_OF_MANY_FILES,
-        "script": '<script type="module" id="script" src="main.js"></script>',
+        "script": f'<script>{_WATCH}</script>\n<script type="module" id="script" src="main.js"></script>',
         "data": "",
     }
     sources[INDEX] = _filled(sources[INDEX], filled)

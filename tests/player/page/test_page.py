@@ -282,10 +282,23 @@ def test_a_page_whose_script_does_not_run_says_what_to_do(
             found.goto(SITE)
         else:
             found.goto((tmp_path / "index.html").as_uri())
-        wait_for(found, lambda: found.locator("#status span").evaluate("e => e.offsetHeight") > 10)
+        wait_for(found, lambda: "script cannot run here. Open " in found.inner_text("#status"))
         said = found.inner_text("#status")
-    assert said.startswith("Loading… If this text stays, the page's script cannot run here. Open ")
     assert ("python -m http.server" in said) == (kind != "one file") == ("scene as one file" in said)
+
+
+@pytest.mark.parametrize("kind", ["one file", "a folder"])
+def test_a_page_that_is_still_arriving_only_says_that_it_loads(
+    chromium: Browser, asset: Asset, kind: str
+) -> None:
+    """A module that has another type does not run, as on a slow line before all of the page has arrived."""
+    answers = site(asset)
+    html = page(asset) if kind == "one file" else answers[SITE][0]
+    arriving, n = re.subn(rb'<script type="module"', b'<script type="text/plain"', html)
+    assert n == 1
+    with opened(chromium, SITE, {**answers, SITE: (arriving, "text/html")}) as found:
+        found.page.evaluate("() => document.getAnimations().forEach((each) => each.finish())")
+        assert found.page.inner_text("#status").strip() == "Loading…"
 
 
 def check_advises_another_device(found: Opened) -> str:
