@@ -4,6 +4,7 @@ instant-ngp and nerfstudio, or a COLMAP model, `sparse/0/cameras.bin`, `images.b
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Sequence
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -26,6 +27,9 @@ from vfr_bake.data.files.pictures import DescribedView
 from vfr_bake.data.store.reading import PictureReader
 
 DISTORTION_KEYS = ("k1", "k2", "k3", "k4", "p1", "p2")
+SAME = 1e-4
+"""Largest difference between numbers of cameras that count as the same, in the units of the file: they may
+have been rounded to different digits."""
 
 
 def load_folder(
@@ -68,6 +72,7 @@ def load_transforms_folder(
     train = _described_views(document, train_file, reader.say)
     if train_file.name == "transforms_train.json" and test_file.exists():
         test = _described_views(load_transforms(test_file), test_file, reader.say)
+        train = _without(train_file, train, test, reader.say)
     else:
         train, test = _listed(document, train_file, train)
     n_train, described = len(train), [*train, *test]
@@ -154,13 +159,13 @@ def _described_views(
 def _each_once(path: Path, views: list[DescribedView], say: Callable[[str], object]) -> list[DescribedView]:
     """Return the views without those that are there already: a view that is there twice would be both learned
     from and held out. Raises DataError: a picture has two different cameras."""
-    known: dict[Path, DescribedView] = {}
+    known: dict[str, DescribedView] = {}
     kept = []
     for index, view in enumerate(views):
-        first = known.setdefault(view.path.resolve(), view)
+        first = known.setdefault(_place(view), view)
         if first is view:
             kept.append(view)
-        elif not np.allclose(first.camera.c2w, view.camera.c2w):
+        elif not _same_camera(first, view):
             raise DataError(
                 f"{path}: frame {index} ({view.camera.name}): expected one camera for each picture, got "
                 "another one in an earlier frame: remove the wrong frame"
@@ -169,6 +174,36 @@ def _each_once(path: Path, views: list[DescribedView], say: Callable[[str], obje
         n_again = len(views) - len(kept)
         say(f"{path.name}: {n_again} of {len(views)} frames repeat earlier ones, and are left out")
     return kept
+
+
+def _without(
+    path: Path, views: list[DescribedView], test: list[DescribedView], say: Callable[[str], object]
+) -> list[DescribedView]:
+    """Return the training views of the file `path` that are no test views: the scores of pictures that were
+    learned from would be too high."""
+    held = {_place(view) for view in test}
+    kept = [view for view in views if _place(view) not in held]
+    if len(kept) < len(views):
+        n_again = len(views) - len(kept)
+        say(
+            f"{path.name}: {n_again} of {len(views)} frames are in transforms_test.json, too, and are left out"
+        )
+    return kept
+
+
+def _place(view: DescribedView) -> str:
+    """Return the path of a picture in one form. Links are not followed: in a cache of downloads, different
+    frames whose pictures are equal are links to one file."""
+    return os.path.normpath(view.path.absolute())
+
+
+def _same_camera(one: DescribedView, other: DescribedView) -> bool:
+    def numbers(view: DescribedView) -> np.ndarray:
+        camera = view.camera
+        lens = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
+        return np.array([*camera.c2w.reshape(-1), *lens, *view.distortion.values()])
+
+    return np.allclose(numbers(one), numbers(other), rtol=0, atol=SAME)
 
 
 def _check_shape(where: str, picture: Path, camera: Camera, size: tuple[int, int]) -> None:

@@ -136,6 +136,52 @@ def test_a_picture_with_two_cameras_is_refused(tmp_path: Path):
     assert "frame 3 (r_1.png): expected one camera for each picture, got another one" in message(folder)
 
 
+@pytest.mark.parametrize("change", [{"fl_x": 9.0}, {"cx": 3.5}, {"k1": 0.01}, {"w": 16, "h": 12}])
+def test_a_picture_with_two_lenses_is_refused(tmp_path: Path, change: dict[str, float]):
+    folder = make_folder(tmp_path / "a", 4, fl_x=8.0, cx=4.0, cy=3.0, w=8, h=6)
+    edit(folder / "transforms.json", lambda d: d["frames"].append({**d["frames"][1], **change}))
+    assert "frame 4 (./r_1): expected one camera for each picture, got another one" in message(folder)
+
+
+def test_two_cameras_far_from_the_origin_are_told_apart(tmp_path: Path):
+    """In the coordinates of a map, 45 m are a hundred thousandth of a position."""
+    folder = make_folder(tmp_path / "a", 4)
+
+    def move(document: Any) -> None:
+        frames = document["frames"]
+        for frame in frames:
+            frame["transform_matrix"][1][3] += 4.5e6
+        frames.append(json.loads(json.dumps(frames[2])))
+        frames[4]["transform_matrix"][1][3] += 45
+
+    edit(folder / "transforms.json", move)
+    assert "frame 4 (./r_2): expected one camera for each picture, got another one" in message(folder)
+
+
+def test_what_is_tested_with_is_not_trained_on(tmp_path: Path):
+    """A picture that both files name is a test view. The files may write its path in two ways."""
+    folder = make_folder(tmp_path / "a", 5, "transforms_train.json")
+    make_folder(folder, 2, "transforms_test.json")
+    edit(folder / "transforms_test.json", lambda d: d["frames"][1].update(file_path="../a/r_1.png"))
+    said: list[str] = []
+    scene = load_scene(folder, reader=PictureReader(say=said.append))
+    assert (names(scene.train), names(scene.test)) == ("2 3 4", "0 ../a/r_1.png")
+    assert said[0] == (
+        "transforms_train.json: 2 of 5 frames are in transforms_test.json, too, and are left out"
+    )
+
+
+def test_links_to_one_picture_are_different_pictures(tmp_path: Path):
+    """A cache of downloads keeps equal pictures once, and links to them."""
+    folder = make_folder(tmp_path / "a", 4)
+    (folder / "r_3.png").unlink()
+    try:
+        (folder / "r_3.png").symlink_to(folder / "r_1.png")
+    except OSError:
+        pytest.skip("needs the right to make links")
+    assert names(load_scene(folder).train) == "0 1 2 3"
+
+
 def test_few_views_are_all_trained_on(tmp_path: Path):
     scene = load_scene(make_folder(tmp_path / "a", 7))
     assert len(scene.train.cameras) == 7 and scene.test.images == []
