@@ -184,10 +184,8 @@ def _without(
     held = {_place(view) for view in test}
     kept = [view for view in views if _place(view) not in held]
     if len(kept) < len(views):
-        n_again = len(views) - len(kept)
-        say(
-            f"{path.name}: {n_again} of {len(views)} frames are in transforms_test.json, too, and are left out"
-        )
+        n_out = len(views) - len(kept)
+        say(f"{path.name}: {n_out} of {len(views)} frames are in transforms_test.json, too, and are left out")
     return kept
 
 
