@@ -48,10 +48,12 @@ export class Controls {
     on(window, "keydown", this.keyDown);
     on(window, "keyup", this.keyUp);
     on(window, "blur", () => this.held.clear());
+    on(document, "fullscreenchange", () => document.fullscreenElement && this.engage());
     viewer.step = (seconds) => this.step(seconds);
   }
 
-  // Take the wheel and fingers from now on. An embedded page leaves them to the page around it until it is clicked.
+  // Take the wheel and fingers from now on. An embedded page leaves them to the page around it until it is clicked or
+  // fills the screen.
   engage() {
     this.engaged = true;
     this.viewer.canvas.style.touchAction = "none";

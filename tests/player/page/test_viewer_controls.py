@@ -190,6 +190,20 @@ def test_embedded_fingers_scroll_the_page_around_it_until_it_is_tapped(chromium:
         assert page.evaluate("() => scrollY") == 0
 
 
+def test_an_embedded_page_that_fills_the_screen_takes_the_wheel(chromium: Browser) -> None:
+    outer = b"<!doctype html><iframe src='index.html#turn=off' allow=fullscreen width=600 height=400></iframe>"
+    with opened(chromium, {**FILES, "outer.html": outer}, wait=False) as (page, *_):
+        page.goto("http://localhost/scene/outer.html")
+        frame = page.frames[1]
+        frame.wait_for_selector("#canvas[data-done]")
+        frame.get_by_role("button", name="Full screen").click()
+        frame.wait_for_function("() => document.getElementById('canvas').style.touchAction === 'none'")
+        before = frame.evaluate("() => drawn.at(-1).c2w")
+        page.mouse.move(300, 200)
+        page.mouse.wheel(0, -300)
+        frame.wait_for_function("before => drawn.at(-1).c2w.some((x, i) => x !== before[i])", arg=before)
+
+
 def test_keys_turn_zoom_and_fly(chromium: Browser) -> None:
     with opened(chromium, FILES, "#turn=off") as (page, *_):
         before = still(page)
