@@ -191,7 +191,7 @@ def test_embedded_fingers_scroll_the_page_around_it_until_it_is_tapped(chromium:
 
 
 def test_an_embedded_page_that_fills_the_screen_takes_the_wheel(chromium: Browser) -> None:
-    outer = b"<!doctype html><iframe src='index.html#turn=off' allow=fullscreen width=600 height=400></iframe>"
+    outer = b"<iframe src='index.html#turn=off' allow=fullscreen width=600 height=400></iframe>"
     with opened(chromium, {**FILES, "outer.html": outer}, wait=False) as (page, *_):
         page.goto("http://localhost/scene/outer.html")
         frame = page.frames[1]
