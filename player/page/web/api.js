@@ -19,9 +19,10 @@ export function installApi(renderer) {
     get info() {
       return found?.info ?? null;
     },
-    render(view) {
+    async render(view) {
+      const asked = structuredClone(view); // as it is now: a script may move it on before its turn comes
       // One picture after another: all at once could take more memory than there is.
-      const picture = last.then(() => ready).then(() => found.render(checked(view)));
+      const picture = last.then(() => ready).then(() => found.render(checked(asked)));
       last = picture.then(() => {}, () => {});
       return picture;
     },

@@ -28,7 +28,14 @@ async function begin() {
   return window.vfr.ready;
 }
 
-const early = { info: null, render: (view) => early.ready.then(() => early.render(view)) };
+const early = {
+  info: null,
+  async render(view) {
+    const asked = structuredClone(view); // as in api.js
+    await early.ready;
+    return early.render(asked);
+  },
+};
 window.vfr = early;
 early.ready = begin();
 early.ready.catch(({ message }) => {

@@ -222,12 +222,35 @@ PLAYS = """async () => {
 }"""
 
 
+EARLY = """
+document.addEventListener("DOMContentLoaded", () => {
+  const c2w = [1, 0, 0, 1, 0, 1, 0, 2, 0, 0, 1, 9, 0, 0, 0, 1];
+  const view = { c2w, fx: 40, fy: 40, cx: 20, cy: 15, width: 40, height: 30, background: [0, 0, 1] };
+  window.early = vfr.render(view).then(({ rgba }) => [...rgba.slice(0, 4)]);
+  view.background[0] = 1;
+});
+"""
+
+
 def check_plays(found: Opened) -> None:
     found.page.wait_for_selector("#canvas[data-shown]")
     played = found.page.evaluate(PLAYS)
     assert (played["early"], played["width"], played["height"]) == ("function", 40, 30)
     assert played["corner"] == [0, 0, 255, 255] and played["middle"] != played["corner"]
     assert [line for line in found.said if "GPU stall due to ReadPixels" not in line] == []
+
+
+def test_a_picture_that_is_asked_for_early_shows_the_view_of_then(
+    chromium: Browser, asset: Asset, tmp_path: Path
+) -> None:
+    path = tmp_path / "scene.html"
+    path.write_bytes(page(asset))
+    with chromium.new_context(offline=True) as context:
+        context.add_init_script(EARLY)
+        found = context.new_page()
+        found.set_default_timeout(SECONDS * 1000)
+        found.goto(path.as_uri())
+        assert found.evaluate("() => early") == [0, 0, 255, 255]
 
 
 def test_a_page_plays_from_a_disk(chromium: Browser, asset: Asset, tmp_path: Path) -> None:

@@ -327,6 +327,24 @@ def test_a_picture_for_which_memory_is_short_is_refused(page: RenderPage, asset:
     assert (page.picture(camera) == before).all()
 
 
+def test_a_view_that_moves_on_changes_no_picture_that_was_asked_for(page: RenderPage, asset: Asset) -> None:
+    camera = scenes.cameras(asset)["outside"]
+    found = page.page.evaluate(
+        """async (view) => {
+          const pictures = [];
+          for (const red of [0, 1]) {
+            view.background[0] = red;
+            view.c2w[3] += red;
+            pictures.push(vfr.render(view));
+          }
+          return (await Promise.all(pictures)).map(({ rgba }) => [...rgba]);
+        }""",
+        view_of(camera) | {"background": [0, 0, 0]},
+    )
+    wanted = page.picture(camera, background=[0, 0, 0])
+    assert (np.reshape(found[0], wanted.shape) == wanted).all() and found[0] != found[1]
+
+
 def test_pictures_that_are_asked_for_at_once_are_rendered_one_after_another(
     page: RenderPage, asset: Asset
 ) -> None:
