@@ -23,7 +23,7 @@ from exporters.formats.parity import check_points_bytes, check_steps, check_volu
 from exporters.formats.transforms import moved_cameras, transforms_bytes
 from exporters.head.asset_head import head_bytes
 from exporters.options import FOLDERS, MESHES, POINTS, ExportOptions, check_options
-from exporters.pages import export_page, is_page_file
+from exporters.pages import export_page, page_files
 from exporters.pictures import export_pictures
 from exporters.shapes.crop import parse_crop
 from exporters.shapes.mesh import TriangleMesh
@@ -35,6 +35,7 @@ from player.cameras.camera import Camera
 from player.cameras.transforms import frame_names
 from player.cameras.views import asset_cameras, read_views
 from player.errors import OutputError
+from player.files.content import content_of
 from player.files.files import check_target, new_folder, write_bytes
 from player.progress import Report, silent
 
@@ -202,13 +203,13 @@ def _check_target(asset_path: Path, target: Path, name: str, force: bool) -> boo
     """
     is_folder = name in FOLDERS
     if target.is_dir() and is_folder:
-        is_ours = {"exr": is_picture, "colmap": is_model_file, "web": is_page_file}[name]
-        found = sorted(target.iterdir())
+        is_ours = page_files(target) if name == "web" else {"exr": is_picture, "colmap": is_model_file}[name]
+        found = content_of(target)
         other = [file.name for file in found if not is_ours(file)]
         if other:
             raise OutputError(
                 f"{target}: expected no folder, or one of {name} files that vfr-export wrote, got {other[0]} "
-                "in it: name another folder"
+                f"in it: name another folder, or move {other[0]} out of it"
             )
         force = force or not found
     elif target.exists() and target.is_dir() != is_folder:

@@ -5,14 +5,14 @@ from __future__ import annotations
 import hashlib
 import json
 import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
 
 from player.asset.asset import Asset
-from player.asset.manifest import FORMAT
-from player.errors import FormatError, ParityError
+from player.asset.target import asset_files
+from player.errors import ParityError
 from player.files.files import new_folder, write_bytes
-from player.files.json_files import parse_json, read_json
 from player.page.page import INDEX, MAX_GPU_MB, is_site_file, page_of_many_files, page_of_one_file
 from player.page.scene_files import MANIFEST
 from player.page.text_bytes import bytes_of_text
@@ -53,15 +53,11 @@ def export_page(
     return {"bytes": n_bytes, "viewer_bytes": made.viewer_bytes, "gpu_bytes": made.gpu_bytes}
 
 
-def is_page_file(path: Path) -> bool:
-    """Return whether a file is one of a page for a web server: it has the name of such a file, and the
-    manifest of a scene is beside it."""
-    beside = path.with_name(MANIFEST)
-    try:
-        manifest = parse_json(read_json(beside, "a manifest"), str(beside))
-    except FormatError:
-        return False
-    return is_site_file(path.name) and isinstance(manifest, dict) and manifest.get("format") == FORMAT
+def page_files(folder: Path) -> Callable[[Path], bool]:
+    """Return the function that tells whether a file in `folder` is one of a page for a web server: it has the
+    name of such a file, and the manifest of a scene is beside it."""
+    has_scene = asset_files(folder) is not None
+    return lambda path: has_scene and is_site_file(path.name)
 
 
 def files_in_page(page: bytes) -> dict[str, bytes]:

@@ -305,7 +305,7 @@ def write_asset(
             reach.
         OutputError: the folder exists, or holds something else than an asset; or the disk is full.
     """
-    check_asset_target(folder, force)
+    force = check_asset_target(folder, force)
     arrays.check(manifest)
     n_before = len(head) + len(cameras)
     parts = write_parts(arrays.densities, arrays.features, manifest, n_before, len(mesh))

@@ -7,11 +7,9 @@ from pathlib import Path
 
 from player.asset.manifest import FORMAT, MAX_BYTES, NAME
 from player.errors import FormatError, OutputError
+from player.files.content import content_of
 from player.files.files import check_target, read_bytes
 from player.files.json_files import parse_json
-
-_OF_SYSTEMS = {".DS_Store", "Thumbs.db", "desktop.ini"}
-"""Files that Finder and Explorer leave in folders that were looked at."""
 
 
 def asset_files(folder: Path) -> set[str] | None:
@@ -32,21 +30,25 @@ def asset_files(folder: Path) -> set[str] | None:
     return {NAME, *listed} if isinstance(listed, dict) else {NAME}
 
 
-def check_asset_target(folder: Path, force: bool = False) -> None:
-    """Raise OutputError, before any work, if an asset cannot be written to `folder`.
+def check_asset_target(folder: Path, force: bool = False) -> bool:
+    """Raise OutputError, before any work, if an asset cannot be written to `folder`; return whether to
+    replace it.
 
-    With `force`, a folder is replaced if it holds an asset and nothing else, or nothing at all.
+    An empty folder is replaced; with `force`, one that holds an asset and nothing else is replaced, too.
 
     >>> check_asset_target(Path("surely/not/there"))
+    False
     """
+    found = content_of(folder)
+    force = force or (folder.is_dir() and not found)
     check_target(folder, force)
-    if not folder.exists():
-        return
-    if not folder.is_dir():
+    if folder.exists() and not folder.is_dir():
         raise OutputError(f"{folder}: expected a folder to write, got a file: name another folder")
     files = asset_files(folder) or set()
-    other = sorted({path.name for path in folder.iterdir()} - files - _OF_SYSTEMS)
+    other = [path.name for path in found if path.name not in files]
     if other:
         raise OutputError(
-            f"{folder}: expected no folder, or one of an asset alone, got {other[0]} in it: name another"
+            f"{folder}: expected no folder, or one of an asset alone, got {other[0]} in it: name another "
+            f"folder, or move {other[0]} out of it"
         )
+    return force

@@ -90,9 +90,10 @@ def test_scale_and_world(asset: Asset) -> None:
 
 def test_existing_folder_is_kept_without_force(asset: Asset, tmp_path: Path) -> None:
     (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "manifest.json").write_text('{"format": "vfr-asset"}')
     with pytest.raises(OutputError, match="already exists: add --force"):
         write_asset(tmp_path / "out", *parts(asset))
-    assert not list((tmp_path / "out").iterdir())
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["manifest.json"]
     write_asset(tmp_path / "out", *parts(asset), force=True)
     assert sorted(p.name for p in (tmp_path / "out").iterdir()) == sorted([*FILES, "manifest.json"])
 
