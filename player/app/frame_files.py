@@ -23,6 +23,7 @@ from player.asset.manifest import MAX_BYTES, NAME
 from player.cameras.camera import Camera
 from player.cameras.transforms import frame_names
 from player.errors import ConfigError, OutputError
+from player.files.content import content_of
 from player.files.files import check_target, read_bytes
 from player.files.images import open_picture, read_key
 from player.files.replace import clear_up
@@ -94,25 +95,22 @@ class Target:
 
     def _check_folder(self, allowed: bool) -> None:
         folder = self.folder
-        try:
-            taken = folder.exists() and (not folder.is_dir() or (not allowed and any(folder.iterdir())))
-        except OSError as error:
-            raise OutputError(f"{folder}: cannot read: {error.strerror}") from error
-        if taken and not folder.is_dir():
+        found = content_of(folder)
+        if folder.exists() and not folder.is_dir():
             raise OutputError(f"{folder}: expected a folder for the pictures, got a file")
-        if taken:
+        if found and not allowed:
             raise OutputError(
                 f"{folder}: not empty: add --force to write into it, replacing frames of equal name, "
                 "or --resume to go on with a run that was interrupted"
             )
 
-    def is_complete(self, key: str) -> bool:
+    def is_complete(self, paths: Sequence[Path], key: str) -> bool:
         """Return whether the video is there already, so that a resumed run has nothing to do.
 
-        Raises ConfigError: there is another video, and no frames of an interrupted run that was to replace
-        it.
+        Raises ConfigError: there is another video, and no frame (`paths`) of an interrupted run that was to
+        replace it.
         """
-        if not self.is_video or not self.path.exists() or self.folder.exists():
+        if not self.is_video or not self.path.exists() or any(path.exists() for path in paths):
             return False
         if read_video_key(self.path) != key:
             raise _another(self.path, "a video")

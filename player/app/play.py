@@ -89,7 +89,7 @@ def play(
     _check_sizes(chosen, target, say)
     keys = [frame_key(asset, camera, settings) for camera in chosen]
     film = video_key(keys, settings.fps)
-    if is_complete := settings.resume and target.is_complete(film):
+    if is_complete := settings.resume and target.is_complete(paths, film):
         missing = []
     else:
         missing = unfinished(paths, keys, chosen) if settings.resume else range(len(chosen))

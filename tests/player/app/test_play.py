@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -317,6 +318,12 @@ def test_a_resumed_video_that_is_complete_is_kept(
     capsys.readouterr()
     assert cli.main([*command, "--resume"]) == 0
     assert "0 pictures (5 were there already) of 48x40, nothing left to render" in capsys.readouterr().out
+    frames = tmp_path / "turn.mp4.frames"
+    frames.mkdir()
+    (frames / ".DS_Store").touch()  # of Finder, which has kept the folder from being removed
+    assert cli.main([*command, "--resume"]) == 0
+    assert "0 pictures (5 were there already) of 48x40, nothing left to render" in capsys.readouterr().out
+    shutil.rmtree(frames)
     for options in (["--samples", "2"], ["--frames", "1:3"], ["--fps", "7"]):
         assert cli.main([*command, "--resume", *options]) == 1
         assert f"{target}: --resume: expected a video of this asset, these views" in capsys.readouterr().err
@@ -324,7 +331,6 @@ def test_a_resumed_video_that_is_complete_is_kept(
     assert [path.name for path in tmp_path.iterdir()] == ["turn.mp4"]
     target.write_bytes(b"mine")
     assert cli.main([*command, "--resume"]) == 1 and target.read_bytes() == b"mine"
-    frames = tmp_path / "turn.mp4.frames"
     assert cli.main([*trained(shells_folder), "--output", str(frames), "--frames", "1:3"]) == 0
     assert cli.main([*command, "--resume"]) == 0
     assert len(decode(target)) == 5 and not frames.exists()
