@@ -21,7 +21,7 @@
 // onProgress({ done, total }) is told the progress in bytes: half of the total is for loading and half for decoding.
 //
 // If the browser or the device cannot decode a scene, the Error that loadScene throws has `isWhole`: true, which says that
-// the data are not to blame, or is a RangeError, with which a browser refuses memory.
+// the data are not to blame, or is one that `refusesMemory` knows.
 
 import { SceneReader, checkedFile } from "./scene_reader.js";
 

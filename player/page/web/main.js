@@ -6,6 +6,7 @@ import { optionsOf } from "./hash.js";
 import { loadScene } from "./loader.js";
 import { Panel } from "./panel.js";
 import { Renderer } from "./renderer.js";
+import { refusesMemory } from "./scene_reader.js";
 import { Viewer } from "./viewer.js";
 
 const INSTEAD = "Open this page in a current Chrome, Edge, Firefox or Safari, with hardware acceleration switched on "
@@ -55,7 +56,7 @@ async function show() {
       panel.connect(viewer, new Controls(viewer), scene.cameras);
     }
   } catch (error) {
-    if (error.isWhole || error instanceof RangeError) advice = INSTEAD;
+    if (error.isWhole || refusesMemory(error)) advice = INSTEAD;
     if (viewer) problem = `This scene cannot be shown whole here: ${error.message}. ${advice}`;
     else panel.fail(`This scene cannot be shown here: ${error.message}. ${advice}`);
     throw error;

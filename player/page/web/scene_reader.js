@@ -21,6 +21,9 @@ export async function checkedFile(name, { text, bytes }, entry) {
   return data;
 }
 
+// Return whether an error says that the browser refuses memory. Damaged data, too, can end in a RangeError.
+export const refusesMemory = (error) => error instanceof RangeError && /alloc|memory/i.test(error.message);
+
 export class SceneReader {
   // `grids`: which of "densities" and "features" to read; `pause`: an async function that is awaited now and then, so that
   // other work can be done in between.

@@ -1,8 +1,8 @@
 // Runs a SceneReader in a worker. Messages { call, args, id } call its methods and are answered by { id, result } or
-// { id, error, isWhole, isMemory }, where isMemory tells that the device has refused memory. While a part is read, messages { progress } tell the bytes of each section. The worker's first
-// message is { isReady: true }.
+// { id, error, isWhole, isMemory }, where isMemory tells that the device has refused memory. While a part is
+// read, messages { progress } tell the bytes of each section. The worker's first message is { isReady: true }.
 
-import { SceneReader } from "./scene_reader.js";
+import { SceneReader, refusesMemory } from "./scene_reader.js";
 
 let reader = null;
 
@@ -20,7 +20,7 @@ self.onmessage = async ({ data: { call, args, id } }) => {
     const arrays = Object.values(result ?? {}).filter(ArrayBuffer.isView);
     postMessage({ id, result }, arrays.map((array) => array.buffer));
   } catch (error) {
-    postMessage({ id, error: error.message, isWhole: reader?.isWhole ?? false, isMemory: error instanceof RangeError });
+    postMessage({ id, error: error.message, isWhole: reader?.isWhole ?? false, isMemory: refusesMemory(error) });
   }
 };
 postMessage({ isReady: true });

@@ -348,19 +348,36 @@ def test_a_scene_that_takes_too_much_memory_to_decode_asks_for_another_device(
         assert "MB of memory: expected at most 3200 MB" in check_advises_another_device(found)
 
 
+def failing_site(asset: Asset, where: str, message: str) -> dict[str, tuple[bytes, str]]:
+    """Return `site` with a RangeError for each DataView of the worker, or of a page that has no worker."""
+    answers = site(asset)
+    begin = f"DataView = class {{ constructor() {{ throw RangeError('{message}'); }} }};\n"
+    if where == "loader.js":
+        begin += "globalThis.Worker = undefined;\n"
+    body, type_ = answers[SITE + where]
+    answers[SITE + where] = (begin.encode() + body, type_)
+    return answers
+
+
 @pytest.mark.parametrize("where", ["worker.js", "loader.js"])
 def test_a_device_that_refuses_memory_is_not_told_that_the_data_are_broken(
     chromium: Browser, asset: Asset, where: str
 ) -> None:
     """Memory is refused to the worker that decodes, and to the page, which then decodes without one."""
-    answers = site(asset)
-    refuse = b"DataView = class { constructor() { throw RangeError('Array buffer allocation failed'); } };\n"
-    if where == "loader.js":
-        refuse += b"globalThis.Worker = undefined;\n"
-    body, type_ = answers[SITE + where]
-    answers[SITE + where] = (refuse + body, type_)
-    with opened(chromium, SITE, answers) as found:
-        assert "Array buffer allocation failed" in check_advises_another_device(found)
+    for message in ("Array buffer allocation failed", "Out of memory"):  # in Chromium, in Safari
+        with opened(chromium, SITE, failing_site(asset, where, message)) as found:
+            assert message in check_advises_another_device(found)
+
+
+@pytest.mark.parametrize("where", ["worker.js", "loader.js"])
+def test_data_that_end_too_soon_are_not_taken_for_a_lack_of_memory(
+    chromium: Browser, asset: Asset, where: str
+) -> None:
+    message = "Offset is outside the bounds of the DataView"
+    with opened(chromium, SITE, failing_site(asset, where, message)) as found:
+        found.page.wait_for_selector("body.failed")
+        said = found.page.inner_text("#status")
+        assert message in said and "load the page again" in said and "memory" not in said
 
 
 def test_a_page_that_was_cut_short_says_so(chromium: Browser, asset: Asset, tmp_path: Path) -> None:
