@@ -405,11 +405,15 @@ class _Bake:
             n_fetches=self.n_fetches,
             background=tuple(model.background.tolist()),
             provenance={
-                "bake": asdict(self.config) | asdict(self.choice),
+                "bake": self._asked(),
                 "train": model.train,
                 "trained": model.figures,
             },
         )
+
+    def _asked(self) -> dict[str, Any]:
+        """Return the settings as resolved, among them the memory, which depends on the machine."""
+        return asdict(self.config) | asdict(self.choice) | {"max_memory": self.config.memory}
 
     def _judge(self, asset: Asset, n_bytes: dict[str, int], name: str) -> BakeReport:
         """Play the written files, which have the sizes `n_bytes`, and report the result. Raises TrainingError
@@ -426,9 +430,8 @@ class _Bake:
                 f"preset {self.config.preset}: expected a loss of at most {self.choice.target_loss_db:g} dB, "
                 f"got {last.loss}"
             )
-        asked = asdict(self.config) | asdict(self.choice)
         return BakeReport(
-            f"{name}: baked with preset {self.config.preset}", asked, self.held_out.table(),
+            f"{name}: baked with preset {self.config.preset}", self._asked(), self.held_out.table(),
             self.held_out.measured_on(), n_bytes, self.seconds, self.left_out, self.lookups, missed,
             list(side_by_side(self.model, asset)),
         )  # fmt: skip

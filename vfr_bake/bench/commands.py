@@ -7,7 +7,7 @@ from typing import Any
 from player.asset.asset import Asset
 from player.march.interpolation import Quality
 from player.terminal import command_line
-from vfr_bake.config import BakeConfig
+from vfr_bake.config import USUAL_MEMORY, BakeConfig
 from vfr_bake.presets import PRESETS
 
 GIVEN = (
@@ -15,6 +15,8 @@ GIVEN = (
     *("max_mb", "max_loss_db", "target_ms", "max_memory"),
 )
 """Settings of `vfr-bake` that change the asset and that no preset decides."""
+USUAL = {"max_memory": USUAL_MEMORY}
+"""The values of those that an asset keeps, too, if they were not given."""
 
 
 def bake_command(folder: str, asset: Asset) -> str:
@@ -25,7 +27,7 @@ def bake_command(folder: str, asset: Asset) -> str:
     if not isinstance(settings, dict) or not isinstance(preset, str) or preset not in PRESETS:
         return ""
     chosen: dict[str, Any] = {
-        name: settings[name] for name in GIVEN if settings.get(name) not in (None, getattr(BakeConfig, name))
+        name: settings[name] for name in GIVEN if settings.get(name) not in (None, USUAL.get(name))
     }
     usual = BakeConfig(preset=preset).choice(asset.manifest.contracted)
     for name in BakeConfig.__dataclass_fields__:

@@ -111,7 +111,7 @@ def test_the_command_that_bakes_again_names_what_was_chosen(contracted: bool, sh
 
     other = BakeConfig().choice(not contracted).refine_steps
     plain = "vfr-bake model.pt out --preset balanced"
-    assert command(BakeConfig()) == plain
+    assert command(BakeConfig()) == command(BakeConfig(max_memory=4)) == plain
     assert command(BakeConfig(refine_steps=other, k=3)) == f"{plain} --refine-steps {other} --k 3"
     given = BakeConfig(feature_resolution=96, weight_floor=0.02, target_ms=50, max_memory=8)
     options = "--feature-resolution 96 --weight-floor 0.02 --target-ms 50 --max-memory 8"
