@@ -152,11 +152,10 @@ def make_plan(model: Model, config: BakeConfig) -> Plan:
     cameras and the head alone take more than `config.max_mb`.
     """
     choice, field = config.choice(model.field.config.unbounded), model.field.config
-    least = _fixed_bytes(model, config) / 1e6
-    if config.max_mb is not None and least >= config.max_mb:
+    if config.max_mb is not None and (least := _fixed_bytes(model, config) / 1e6) >= config.max_mb:
         raise TrainingError(
-            f"bake: size: expected at most {config.max_mb:g} MB, got {least:.2g} MB for {len(model.cameras)} "
-            "cameras and the head alone: nothing was written: allow more"
+            f"bake: size: expected at most {config.max_mb:g} MB, got {np.ceil(100 * least) / 100:.2f} MB for "
+            f"{len(model.cameras)} cameras and the head alone: nothing was written: allow more"
         )
     resolutions = _resolutions(model, config)
     fine, coarse = resolutions

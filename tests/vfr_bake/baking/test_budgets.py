@@ -113,7 +113,9 @@ def test_time_that_is_left_changes_nothing(model: Model, tmp_path: Path) -> None
     assert (a.n_fetches, a.files["head.onnx"].bytes) == (b.n_fetches, b.files["head.onnx"].bytes)
 
 
-def test_a_size_that_cannot_be_met_is_refused_when_the_bake_is_planned(model: Model) -> None:
+def test_a_size_that_cannot_be_met_is_refused_when_the_bake_is_planned(
+    model: Model, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The cameras of the pictures, and the head, take bytes that no choice of grids saves."""
     cameras = len(write_cameras(model.cameras))
     head = model.field.config.n_directional_layers * model.field.config.head_width**2
@@ -128,6 +130,9 @@ def test_a_size_that_cannot_be_met_is_refused_when_the_bake_is_planned(model: Mo
     many = replace(model, cameras=model.cameras * 200)
     with pytest.raises(TrainingError, match=r"expected at most 1 MB, got .* MB for \d+ cameras and the head"):
         make_plan(many, BakeConfig(max_mb=1))
+    monkeypatch.setattr("vfr_bake.baking.plan._fixed_bytes", lambda model, config: 1_024_000)
+    with pytest.raises(TrainingError, match=r"expected at most 1\.02 MB, got 1\.03 MB for"):
+        make_plan(model, BakeConfig(max_mb=1.02))
 
 
 @pytest.mark.parametrize(("machine", "memory"), [(2 << 30, 1.07), (4 << 30, 2.15), (64 << 30, 4.0)])
@@ -334,6 +339,7 @@ def test_the_mesh_is_at_most_a_tenth_of_the_asset(
     assert 0.05 * total < sizes["mesh.ply"] <= 0.1 * total
     assert len(read_ply(tmp_path / "asset" / "mesh.ply").faces) == result.figures["mesh_faces"]
     assert asset.manifest.provenance["baked"]["mesh_faces"] == result.figures["mesh_faces"]
+    assert asset.manifest.provenance["bake"]["max_memory"] == settings.memory, "not null, but what it was"
     assert result.seconds >= result.figures["time"]["mesh"] > 0
 
 
