@@ -25,6 +25,14 @@ if TYPE_CHECKING:  # `--help` answers without numpy
     from player.cameras.camera import Camera
 
 
+RESULTS = (
+    {"ms_median", "frames", "peak_rss_mb"},
+    {"bytes_total", "n_bricks", "world_box"},  # --info
+    {"ok", "files"},  # --check
+)
+"""Keys by which a JSON file is known as an earlier result, which is replaced."""
+
+
 def main(argv: list[str] | None = None) -> int:
     """Run `vfr-play`; returns the exit code: one of `player.app.commands.run`, or 2 for wrong usage."""
     try:
@@ -35,7 +43,7 @@ def main(argv: list[str] | None = None) -> int:
 
 def _run(arguments: argparse.Namespace) -> int:
     inputs = [arguments.asset, *([] if arguments.cameras is None else [arguments.cameras])]
-    check_result(arguments.json, inputs, arguments.output)
+    check_result(arguments.json, inputs, RESULTS, arguments.output)
     if arguments.check:
         return _check(arguments)
     if arguments.info:

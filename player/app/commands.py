@@ -8,13 +8,15 @@ import json
 import os
 import select
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Set
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, TextIO
 
-from player.errors import OutputError, VfrError
+from player.errors import FormatError, OutputError, VfrError
+from player.files.content import has_content
 from player.files.files import check_target, write_bytes
+from player.files.json_files import parse_json, read_json
 from player.terminal import printable
 
 READER_GONE = 141
@@ -67,24 +69,32 @@ def run(name: str, command: Callable[[], int]) -> int:
         return 130
 
 
-def check_result(target: str | Path | None, inputs: Iterable[Path], output: Path | None = None) -> None:
+def check_result(
+    target: str | Path | None,
+    inputs: Iterable[Path],
+    kinds: Iterable[Set[str]],
+    output: Path | None = None,
+    force: bool = True,
+) -> None:
     """Check the file of `write_result` before long work.
 
     Args:
         target: a file, "-" for standard output, or None for no JSON.
         inputs: files and folders that the command reads; neither they nor anything in them is replaced.
+        kinds: keys by which a JSON file is known as an earlier result: all of one kind are in it.
         output: what else the command writes.
+        force: whether an earlier result, or an empty file, is replaced; nothing else ever is.
 
-    Raises OutputError: the file cannot be written, is or lies in an input, or is the output.
+    Raises OutputError: the file cannot be written, is or lies in an input, is the output, or is no result.
 
-    >>> check_result("out/manifest.json", [Path("out")])
+    >>> check_result("out/manifest.json", [Path("out")], [{"frames"}])
     Traceback (most recent call last):
     player.errors.OutputError: out/manifest.json: --json: expected a file outside out, which is read
     """
     if target is None or str(target) == "-":
         return
     path = Path(target)
-    check_target(path, force=True, is_file=True)
+    check_target(path, force, is_file=True)
     place = path.resolve()
     for read in inputs:
         if place.is_relative_to(read.resolve()):
@@ -92,6 +102,10 @@ def check_result(target: str | Path | None, inputs: Iterable[Path], output: Path
             raise OutputError(f"{path}: --json: expected {where} {read}, which is read")
     if output is not None and place == output.resolve():
         raise OutputError(f"{path}: --json: expected another file than --output")
+    if has_content(path) and not _is_result(path, kinds):
+        raise OutputError(
+            f"{path}: --json: expected a new file or an earlier result, got another file: name a new one"
+        )
 
 
 def write_result(target: str | Path | None, figures: dict[str, Any], sentence: str | None) -> None:
@@ -116,6 +130,14 @@ def write_result(target: str | Path | None, figures: dict[str, Any], sentence: s
         write_bytes(Path(target), text.encode())
     if sentence is not None:
         sys.stdout.write(f"{sentence}\n")
+
+
+def _is_result(path: Path, kinds: Iterable[Set[str]]) -> bool:
+    try:
+        document = parse_json(read_json(path, "a result"), str(path))
+    except FormatError:
+        return False
+    return isinstance(document, dict) and any(keys <= set(document) for keys in kinds)
 
 
 def _described(error: OSError) -> str:

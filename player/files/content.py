@@ -1,4 +1,4 @@
-"""What is in a folder that is to be written, apart from what systems put into every folder."""
+"""What is in the files and folders that are to be written."""
 
 from __future__ import annotations
 
@@ -27,6 +27,15 @@ def content_of(folder: Path) -> list[Path]:
     except OSError as error:
         raise OutputError(f"{folder}: cannot read: {error.strerror or error}") from error
     return [path for path in found if not _is_of_a_system(path.name)]
+
+
+def has_content(path: Path) -> bool:
+    """Return whether there is something else at `path` than an empty file.
+
+    >>> has_content(Path("surely/not/there"))
+    False
+    """
+    return path.exists() and (not path.is_file() or path.stat().st_size > 0)
 
 
 def _is_of_a_system(name: str) -> bool:

@@ -9,9 +9,9 @@ from zipfile import ZIP_STORED, BadZipFile, ZipFile
 
 from player.app.commands import check_result
 from player.asset.target import asset_files
-from player.errors import FormatError, OutputError
+from player.errors import OutputError
+from player.files.content import has_content
 from player.files.files import check_target
-from player.files.json_files import parse_json, read_json
 
 RESULTS = (
     {"model", "steps", "seconds"},  # vfr-train
@@ -27,22 +27,22 @@ def check_model_target(path: Path, force: bool) -> None:
     """Raise OutputError if a model cannot be written to `path`. With `force`, a model or an empty file is
     replaced, and nothing else."""
     check_target(path, force, is_file=True)
-    if _has_content(path) and not _is_model(path):
+    if has_content(path) and not _is_model(path):
         raise OutputError(
             f"{path}: expected a new file or an earlier model, got another file: name a new one"
         )
 
 
-def check_page_target(path: Path, force: bool) -> None:
-    """Raise OutputError if a web page cannot be written to `path`. With `force`, a page or an empty file is
-    replaced, and nothing else."""
-    check_target(path, force, is_file=True)
-    if _has_content(path):
+def check_page_target(path: Path, force: bool, mark: str | None = None) -> None:
+    """Raise OutputError if a web page cannot be written to `path`. With `force`, or if it has the `mark` near
+    its beginning, a page is replaced; with `force`, an empty file, too; and nothing else."""
+    begin = b""
+    if path.is_file():
         with path.open("rb") as file:
-            if file.read(9).lower() != b"<!doctype":
-                raise OutputError(
-                    f"{path}: expected a new file or an earlier page, got another file: name a new one"
-                )
+            begin = file.read(200)
+    check_target(path, force or (mark is not None and mark.encode() in begin), is_file=True)
+    if has_content(path) and not begin.lower().startswith(b"<!doctype"):
+        raise OutputError(f"{path}: expected a new file or an earlier page, got another file: name a new one")
 
 
 def check_json_target(
@@ -56,18 +56,13 @@ def check_json_target(
         output: a file or folder that the command writes; the result may be neither it nor in it.
         force: whether an earlier result is replaced; nothing else ever is.
     """
+    check_result(path, inputs, RESULTS, force=force)
     if path is None or str(path) == "-":
         return
-    check_result(path, inputs)
-    check_target(path, force, is_file=True)
     if output is not None and path.resolve().is_relative_to(output.resolve()):
         raise OutputError(f"{path}: --json: expected a file outside {output}, which is written, too")
     if asset_files(path.parent) is not None:
         raise OutputError(f"{path}: --json: expected a file outside the asset {path.parent}")
-    if _has_content(path) and not _is_result(path):
-        raise OutputError(
-            f"{path}: --json: expected a new file or an earlier result, got another file: name a new one"
-        )
 
 
 def check_pictures_target(folder: Path, data: str) -> None:
@@ -76,10 +71,6 @@ def check_pictures_target(folder: Path, data: str) -> None:
     check_target(folder / "0.png", force=True, is_file=True)
     if data != "demo" and folder.resolve().is_relative_to(Path(data).resolve()):
         raise OutputError(f"{folder}: --pictures: expected a folder outside {data}, which is read")
-
-
-def _has_content(path: Path) -> bool:
-    return path.exists() and (not path.is_file() or path.stat().st_size > 0)
 
 
 def _is_model(path: Path) -> bool:
@@ -96,11 +87,3 @@ def _is_model(path: Path) -> bool:
             )
     except (BadZipFile, OSError):
         return False
-
-
-def _is_result(path: Path) -> bool:
-    try:
-        document = parse_json(read_json(path, "a result"), str(path))
-    except FormatError:
-        return False
-    return isinstance(document, dict) and any(keys <= set(document) for keys in RESULTS)

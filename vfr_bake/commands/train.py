@@ -142,8 +142,7 @@ def _check(options: Any) -> int:
     from vfr_bake.data.check.page import MARK, check_page
 
     page = options.html or Path(f"{Path(options.data).resolve().stem}_check.html")
-    ours = page.is_file() and MARK.encode() in page.read_bytes()[:200]
-    check_page_target(page, options.force or ours)
+    check_page_target(page, options.force, MARK)
     check_json_target(options.json, [], page)
     with Bar("looking") as bar:
         check = check_data(options.data, working_size(options.config), progress=bar.count)

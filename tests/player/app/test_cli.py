@@ -88,6 +88,7 @@ def test_json_replaces_no_input_and_is_checked_first(
     cameras, view = tmp_path / "cameras.json", tmp_path / "view.png"
     shutil.copy(shells_folder / "cameras.json", cameras)
     (tmp_path / "file").write_text("mine")
+    (tmp_path / "mine.json").write_text('{"frames": []}')
     manifest = shells_folder / "manifest.json"
     before = {path: path.read_bytes() for path in (manifest, cameras)}
     asset, files = str(shells_folder), ["--cameras", str(cameras), "--frames", "0", "--output", str(view)]
@@ -98,13 +99,16 @@ def test_json_replaces_no_input_and_is_checked_first(
         (files, view, "--json: expected another file than --output"),
         (files, tmp_path / "file" / "x.json", "cannot write: "),
         (files, tmp_path, "expected a file to write, got a folder"),
+        (files, tmp_path / "file", "--json: expected a new file or an earlier result, got another file"),
+        (["--info"], tmp_path / "mine.json", "--json: expected a new file or an earlier result, got another"),
     ):
         assert cli.main([asset, *options, "--json", str(target)]) == 1
         printed = capsys.readouterr()
         assert printed.err.startswith(f"vfr-play: error: {target}: {message}") and not printed.out
     assert {path: path.read_bytes() for path in before} == before and not view.exists()
     assert cli.main([asset, *files, "--json", str(tmp_path / "play.json")]) == 0
-    assert cli.main([asset, *files, "--force", "--json", str(tmp_path / "play.json")]) == 0
+    for options in ([*files, "--force"], ["--info"], ["--check"], ["--info"]):
+        assert cli.main([asset, *options, "--json", str(tmp_path / "play.json")]) == 0
 
 
 @pytest.mark.parametrize(

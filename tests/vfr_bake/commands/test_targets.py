@@ -79,6 +79,10 @@ def test_models_and_pages_are_replaced_with_force_alone(tmp_path: Path) -> None:
             check_model_target(path, True)
     with pytest.raises(OutputError, match="expected a new file or an earlier page"):
         check_page_target(model, True)
+    page.write_text("<!DOCTYPE html>\n<!-- ours -->")
+    check_page_target(page, False, "<!-- ours -->")
+    with pytest.raises(OutputError, match="already exists: add --force"):
+        check_page_target(page, False, "<!-- theirs -->")
 
 
 COMMANDS = [
