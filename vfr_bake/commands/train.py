@@ -16,6 +16,7 @@ from player.errors import MissingExtraError, OutputError, VfrError
 from player.files.files import check_target, write_bytes
 from player.progress import Bar, Bars
 from player.terminal import printable
+from vfr_bake.commands.ctrl_c import CtrlC
 from vfr_bake.commands.evaluate import finite
 from vfr_bake.commands.targets import check_json_target, check_model_target, check_page_target
 from vfr_bake.config import TrainConfig
@@ -123,8 +124,11 @@ def _finish(options: Any, trainer: Trainer, scene: Scene, figures: dict[str, Any
         else:
             save_model(options.model, replace(model, figures=figures))
     if interrupted:
-        if not (why := _unsaved(checkpoint, trainer)):
-            why = f"interrupted: the same command with --resume goes on; {checkpoint} is kept for it"
+        try:
+            why = _unsaved(checkpoint, trainer)
+        except KeyboardInterrupt:
+            why = f"interrupted twice: {checkpoint} is not written anew"
+        why = why or f"interrupted: the same command with --resume goes on; {checkpoint} is kept for it"
         print(f"vfr-train: {printable(why)}", file=sys.stderr)
     else:
         checkpoint.unlink(missing_ok=True)
@@ -254,47 +258,47 @@ def _preview(options: Any, scene: Scene) -> Preview:
 
 
 def _train_steps(trainer: Trainer, checkpoint: Path, preview: Preview | None) -> dict[str, Any]:
-    """Train to the end or to Ctrl-C, with a checkpoint now and then; return the figures to report."""
+    """Train to the end, or to the end of the step in which Ctrl-C is pressed, with a checkpoint now and then;
+    return the figures to report. In the first step, and pressed twice, it raises KeyboardInterrupt."""
     from vfr_bake.training.length.expectation import EXPECTED_AT, TIMED_FROM, typical_step
     from vfr_bake.training.scores.metrics import decibels
 
-    last = None
     interrupted = told = False
     ends: list[float] = []
     saved = time.monotonic()
-    with Bar("training", trainer.processes.first) as bar:
+    with Bar("training", trainer.processes.first) as bar, CtrlC() as ctrl_c:
         error, n_steps, rays = 0.0, 0, 0.0
-        try:
-            for last in trainer.run():
-                weight = max(0.02, 1 / (n_steps + 1))
-                n_steps += 1
-                if last.loss == last.loss:  # a skipped step reports NaN
-                    error += weight * (last.loss - error)
-                    rays += weight * (last.n_rays - rays)
-                rate = rays * (last.step + 1) / max(last.seconds, 1e-9)
-                skipped = f"  {trainer.n_bad_steps} skipped" if trainer.n_bad_steps else ""
-                bar.share(
-                    last.progress,
-                    f"loss {error:.5f}  PSNR {decibels(error):.2f} dB  {rate:,.0f} rays/s{skipped}",
-                )
-                if TIMED_FROM <= trainer.next_step <= EXPECTED_AT:
-                    ends.append(last.seconds)
-                if trainer.next_step == EXPECTED_AT and len(ends) > 1:
-                    _expect(trainer, typical_step(ends), bar)
-                if preview is not None:
-                    preview.update(trainer)
-                due = time.monotonic() - saved > 60 * trainer.config.checkpoint_minutes
-                if due and trainer.processes.first:
-                    why = _unsaved(checkpoint, trainer)
-                    if why and not told:
-                        bar.close()
-                        print(f"vfr-train: {printable(why)}: training goes on without it", file=sys.stderr)
-                        told = True
-                    saved = time.monotonic()
-        except KeyboardInterrupt:
-            interrupted = True
-    if last is None and interrupted:
-        raise KeyboardInterrupt
+        for last in trainer.run():
+            ctrl_c.waits = True  # before the first step is done, there is nothing to keep
+            weight = max(0.02, 1 / (n_steps + 1))
+            n_steps += 1
+            if last.loss == last.loss:  # a skipped step reports NaN
+                error += weight * (last.loss - error)
+                rays += weight * (last.n_rays - rays)
+            rate = rays * (last.step + 1) / max(last.seconds, 1e-9)
+            skipped = f"  {trainer.n_bad_steps} skipped" if trainer.n_bad_steps else ""
+            bar.share(
+                last.progress,
+                f"loss {error:.5f}  PSNR {decibels(error):.2f} dB  {rate:,.0f} rays/s{skipped}",
+            )
+            if trainer.processes.total(float(ctrl_c.pressed))[0]:  # all processes end after the same step
+                interrupted = True
+                break
+            if TIMED_FROM <= trainer.next_step <= EXPECTED_AT:
+                ends.append(last.seconds)
+            if trainer.next_step == EXPECTED_AT and len(ends) > 1:
+                _expect(trainer, typical_step(ends), bar)
+            if preview is not None:
+                preview.update(trainer)
+            due = time.monotonic() - saved > 60 * trainer.config.checkpoint_minutes
+            if due and trainer.processes.first:
+                why = _unsaved(checkpoint, trainer)
+                if why and not told:
+                    bar.close()
+                    print(f"vfr-train: {printable(why)}: training goes on without it", file=sys.stderr)
+                    told = True
+                saved = time.monotonic()
+    interrupted = interrupted or ctrl_c.pressed  # after the last step
     if preview is not None:
         preview.write(trainer)
     return {

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+import signal
 from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 
 from player.errors import OutputError
 from vfr_bake.cli import train_main
 from vfr_bake.training.checkpoint import checkpoint_path
 from vfr_bake.training.model_file import load_model
-from vfr_bake.training.trainer import StepReport, Trainer
+from vfr_bake.training.trainer import Trainer
 
 SMALL = [
     *("--n-levels", "4", "--max-resolution", "32", "--log2-table-size", "12", "--device", "cpu"),
@@ -26,27 +27,37 @@ def interrupt(*_: Any) -> None:
     raise KeyboardInterrupt
 
 
+def press_in_step(step: int, times: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Press Ctrl-C in the middle of a step: after its gradients, before its tables are stepped."""
+    whole = Trainer._backward
+
+    def backward(trainer: Trainer, *arguments: Any) -> bool:
+        finite = whole(trainer, *arguments)
+        for _ in range(times if trainer.next_step == step else 0):
+            signal.raise_signal(signal.SIGINT)
+        return finite
+
+    monkeypatch.setattr(Trainer, "_backward", backward)
+
+
 def test_an_interrupted_training_goes_on(
     small_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Ctrl-C leaves the model and a checkpoint, and --resume goes on and replaces the model."""
+    """Ctrl-C in the middle of a step leaves the model and a checkpoint as they are after that step, and
+    --resume goes on and replaces the model by the one that a training without an interruption gives."""
     model, report = tmp_path / "model.pt", tmp_path / "train.json"
     words = [str(small_data), str(model), *SMALL, "--json", str(report)]
 
-    def run(trainer: Trainer) -> Iterator[StepReport]:
-        for step in whole(trainer):
-            yield step
-            if trainer.next_step == 7:
-                raise KeyboardInterrupt
-
-    whole = Trainer.run
-    monkeypatch.setattr(Trainer, "run", run)
+    alone = tmp_path / "alone.pt"
+    assert train_main([str(small_data), str(alone), *SMALL]) == 0
+    capsys.readouterr()
+    press_in_step(6, 1, monkeypatch)
     assert train_main(words) == 130
     said = capsys.readouterr()
     assert "interrupted: the same command with --resume goes on" in said.err and "(stopped early)" in said.out
     assert load_model(model).figures["steps"] == json.loads(report.read_text())["steps"] == 7
-    assert checkpoint_path(model).exists()
-    monkeypatch.setattr(Trainer, "run", whole)
+    assert checkpoint_path(model).exists() and signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    monkeypatch.undo()
     assert train_main(words) == 1
     assert "model.pt: already exists: add --force" in capsys.readouterr().err
     # The training that has written the checkpoint has held it, so the usual share of memory is no limit.
@@ -56,6 +67,37 @@ def test_an_interrupted_training_goes_on(
     assert "going on after step 7" in capsys.readouterr().err
     assert load_model(model).figures["steps"] == json.loads(report.read_text())["steps"] == 12
     assert not checkpoint_path(model).exists()
+    fields = [load_model(path).field.state_dict() for path in (alone, model)]
+    assert all(torch.equal(tensor, fields[1][name]) for name, tensor in fields[0].items())
+
+
+@pytest.mark.parametrize(("step", "times"), [(0, 1), (6, 2)])
+def test_ctrl_c_in_the_first_step_or_twice_ends_at_once(
+    step: int,
+    times: int,
+    small_data: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """Nothing is written of a step that is half done."""
+    press_in_step(step, times, monkeypatch)
+    assert train_main([str(small_data), str(tmp_path / "model.pt"), *SMALL]) == 130
+    assert capsys.readouterr().err.endswith("vfr-train: interrupted\n")
+    assert not (tmp_path / "model.pt").exists() and not checkpoint_path(tmp_path / "model.pt").exists()
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_a_second_ctrl_c_while_the_checkpoint_is_written(
+    small_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The model, which is written first, is reported nevertheless."""
+    press_in_step(6, 1, monkeypatch)
+    monkeypatch.setattr("vfr_bake.training.checkpoint.save_checkpoint", interrupt)
+    assert train_main([str(small_data), str(tmp_path / "model.pt"), *SMALL]) == 130
+    said = capsys.readouterr()
+    assert "interrupted twice: " in said.err and "model.pt: 7 steps" in said.out
+    assert load_model(tmp_path / "model.pt").figures["steps"] == 7
 
 
 @pytest.mark.parametrize("force", [[], ["--force"]])
