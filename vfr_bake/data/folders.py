@@ -72,7 +72,7 @@ def load_transforms_folder(
     train = _described_views(document, train_file, reader.say)
     if train_file.name == "transforms_train.json" and test_file.exists():
         test = _described_views(load_transforms(test_file), test_file, reader.say)
-        train = _without(train_file, train, test, reader.say)
+        train, test = _apart(train, test, reader.say)
     else:
         train, test = _listed(document, train_file, train)
     n_train, described = len(train), [*train, *test]
@@ -176,17 +176,24 @@ def _each_once(path: Path, views: list[DescribedView], say: Callable[[str], obje
     return kept
 
 
-def _without(
-    path: Path, views: list[DescribedView], test: list[DescribedView], say: Callable[[str], object]
-) -> list[DescribedView]:
-    """Return the training views of the file `path` that are no test views: the scores of pictures that were
-    learned from would be too high."""
+def _apart(
+    train: list[DescribedView], test: list[DescribedView], say: Callable[[str], object]
+) -> tuple[list[DescribedView], list[DescribedView]]:
+    """Return the training views that are no test views, because the scores of pictures that were learned from
+    would be too high; and the test views. If that leaves nothing to train on, because one file is a copy of
+    the other, there are no test views: some training views are held out then, as without that file."""
     held = {_place(view) for view in test}
-    kept = [view for view in views if _place(view) not in held]
-    if len(kept) < len(views):
-        n_out = len(views) - len(kept)
-        say(f"{path.name}: {n_out} of {len(views)} frames are in transforms_test.json, too, and are left out")
-    return kept
+    kept = [view for view in train if _place(view) not in held]
+    if len(kept) < 2 <= len(train):
+        say("transforms_test.json repeats the frames of transforms_train.json, and is not used")
+        return train, []
+    if len(kept) < len(train):
+        n_out = len(train) - len(kept)
+        say(
+            f"transforms_train.json: {n_out} of {len(train)} frames are in transforms_test.json, too, and "
+            "are left out"
+        )
+    return kept, test
 
 
 def _place(view: DescribedView) -> str:

@@ -171,6 +171,15 @@ def test_what_is_tested_with_is_not_trained_on(tmp_path: Path):
     )
 
 
+def test_a_copy_of_the_training_file_holds_nothing_out(tmp_path: Path):
+    folder = make_folder(tmp_path / "a", 9, "transforms_train.json")
+    (folder / "transforms_test.json").write_bytes((folder / "transforms_train.json").read_bytes())
+    said: list[str] = []
+    scene = load_scene(folder, reader=PictureReader(say=said.append))
+    assert (names(scene.train), names(scene.test)) == ("1 2 3 4 5 6 7", "0 8")
+    assert said[0] == "transforms_test.json repeats the frames of transforms_train.json, and is not used"
+
+
 def test_links_to_one_picture_are_different_pictures(tmp_path: Path):
     """A cache of downloads keeps equal pictures once, and links to them."""
     folder = make_folder(tmp_path / "a", 4)
