@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from player.cameras.camera import Camera
-from player.cameras.colmap import colmap_folder, read_cameras, read_images, read_points
+from player.cameras.colmap import RegisteredImage, colmap_folder, read_cameras, read_images, read_points
 from player.cameras.transforms import load_transforms, transforms_cameras, transforms_number
 from player.errors import DataError, FormatError
 from player.files.json_files import brief
@@ -288,8 +288,9 @@ def load_colmap_folder(
 
     Pictures are looked for in `images/` and in the folder itself; every eighth is held out. The pixels are
     taken as stored, unless this project estimated the model from upright pictures, or the cameras belong to
-    upright pictures (`is_taken_upright`). Raises DataError (pictures, camera models) or FormatError (the
-    model's files), in one line that names the file.
+    upright pictures (`is_taken_upright`). Pictures that were removed after this project estimated the model
+    are left out, and the reader says so; it also says which were replaced. Raises DataError (pictures, camera
+    models) or FormatError (the model's files), in one line that names the file.
     """
     model = colmap_folder(folder)
     assert model is not None
@@ -299,8 +300,10 @@ def load_colmap_folder(
         raise DataError(f"{model}: registered pictures: expected at least 2, got {len(registered)}")
     points_file = model / "points3D.bin"
     points = read_points(points_file) if points_file.exists() else None
-    upright = read_record(model).upright
-    described = []
+    record, reader = read_record(model), reader or PictureReader()
+    if record.upright:
+        registered = _still_there(folder, registered, reader.say)
+    described, replaced = [], []
     for image in registered:
         if image.camera_id not in lenses:
             raise FormatError(f"{model}: {image.name}: camera {image.camera_id} is not in cameras.bin")
@@ -308,21 +311,55 @@ def load_colmap_folder(
         size = (lens.width, lens.height)
         camera = Camera(image.name, image.c2w, *size, lens.fx, lens.fy, lens.cx, lens.cy)
         picture = _colmap_picture(folder, image.name)
+        if record.n_bytes.get(image.name, n_bytes := picture.stat().st_size) != n_bytes:
+            replaced.append(image.name)
         layout = _layout(picture)
-        turned = upright or is_taken_upright(layout, size)
+        turned = record.upright or is_taken_upright(layout, size)
         shape = layout.upright_size if turned else layout.size
         _check_shape(f"{model}: {image.name}", picture, camera, shape)
         mask = mask_of(folder, image.name)
         described.append(DescribedView(picture, camera, lens.distortion, turned, mask))
-    train, test = held_out((reader or PictureReader()).read(described, progress))
+    if replaced:
+        reader.say(
+            f"{len(replaced)} of {len(registered)} pictures are not those whose cameras were estimated "
+            f"({replaced[0]}): remove {folder / 'sparse'} to have the cameras estimated anew"
+        )
+    train, test = held_out(reader.read(described, progress))
     return _capture(folder, described, train, test, points)
 
 
+def _still_there(
+    folder: Path, registered: list[RegisteredImage], say: Callable[[str], object]
+) -> list[RegisteredImage]:
+    """Return the images of an estimated model whose pictures have not been removed since. Raises DataError:
+    fewer than two."""
+    there = [image for image in registered if _found_picture(folder, image.name) is not None]
+    gone = [image.name for image in registered if _found_picture(folder, image.name) is None]
+    if not gone:
+        return there
+    anew = f"remove {folder / 'sparse'} to have the cameras estimated anew"
+    if len(there) < 2:
+        raise DataError(
+            f"{folder}: pictures whose cameras were estimated: expected at least 2, got {len(there)} "
+            f"({gone[0]} is missing): {anew}"
+        )
+    say(
+        f"{len(gone)} of {len(registered)} pictures whose cameras were estimated are missing ({gone[0]}), "
+        f"and the others are used: {anew}"
+    )
+    return there
+
+
 def _colmap_picture(folder: Path, name: str) -> Path:
+    found = _found_picture(folder, name)
+    if found is None:
+        raise DataError(f"{folder}: {name}: picture is missing: expected {folder / 'images' / name}")
+    return found
+
+
+def _found_picture(folder: Path, name: str) -> Path | None:
     inside = Path(name)
     if inside.is_absolute() or ".." in inside.parts:
         raise FormatError(f"{folder}: {name}: expected a picture inside the folder")
-    for candidate in (folder / "images" / inside, folder / inside):
-        if candidate.is_file():
-            return candidate
-    raise DataError(f"{folder}: {name}: picture is missing: expected {folder / 'images' / name}")
+    candidates = (folder / "images" / inside, folder / inside)
+    return next((candidate for candidate in candidates if candidate.is_file()), None)

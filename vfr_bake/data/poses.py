@@ -184,6 +184,7 @@ def estimate_cameras(
         say(f"cameras of the form of {unread} are not read: cameras are estimated from the pictures alone")
     names = [path.relative_to(place).as_posix() for path in pictures]
     masked = [(path, mask_of(photos, name)) for path, name in zip(pictures, names, strict=True)]
+    n_bytes = {name: path.stat().st_size for path, name in zip(pictures, names, strict=True)}
     known = KeptMatches.of(photos, cache_root(), say)
     looks = look_at(masked, known, lambda done, of: progress("features", done, of))
     repeated = _repeated(photos, looks)
@@ -214,7 +215,7 @@ def estimate_cameras(
     if not model.exists():  # another process may have been faster
         with new_folder(model) as new:
             models[0].write_binary(str(new))
-            write_record(new, EstimateRecord(True, left_out, reasons, apart))
+            write_record(new, EstimateRecord(True, left_out, reasons, apart, n_bytes))
     known.remove()
     return _read_report(model, photos, len(pictures))
 

@@ -17,7 +17,9 @@ from player.cameras.rotations import OPENGL_FROM_OPENCV
 from player.errors import DataError, FormatError
 from vfr_bake.data import load_scene
 from vfr_bake.data.demo import demo_cameras
+from vfr_bake.data.files.estimate_record import EstimateRecord, read_record, write_record
 from vfr_bake.data.folders import load_folder
+from vfr_bake.data.store.reading import PictureReader
 
 SIZE = 24
 LENSES = {
@@ -142,6 +144,52 @@ def test_what_cannot_be_served_is_said(folder: Path, tmp_path: Path) -> None:
     alone = write_model(tmp_path / "alone", demo_cameras(SIZE, 1))
     with pytest.raises(DataError, match="registered pictures: expected at least 2, got 1"):
         load_folder(alone)
+
+
+def test_other_pictures_under_the_old_names_are_told_of(folder: Path) -> None:
+    """Pictures of another size than those that were estimated are named; a record without sizes says
+    nothing."""
+    model, said = folder / "sparse" / "0", []
+    n_bytes = {path.name: path.stat().st_size for path in (folder / "images").iterdir()}
+    write_record(model, EstimateRecord(True, n_bytes=n_bytes))
+    assert read_record(model).n_bytes == n_bytes
+    load_folder(folder, None, PictureReader(say=said.append))
+    assert not [text for text in said if "estimated" in text]
+    for name in ("003.png", "005.png"):
+        Image.new("RGB", (SIZE, SIZE)).save(folder / "images" / name)
+    load_folder(folder, None, PictureReader(say=said.append))
+    (text,) = (text for text in said if "estimated" in text)
+    assert text == (
+        "2 of 10 pictures are not those whose cameras were estimated (003.png): remove "
+        f"{folder / 'sparse'} to have the cameras estimated anew"
+    )
+    (model / "pictures.json").write_text('{"upright": true}')
+    said.clear()
+    load_folder(folder, None, PictureReader(say=said.append))
+    assert not [text for text in said if "estimated" in text]
+    (model / "pictures.json").write_text('{"upright": true, "n_bytes": {"003.png": "9"}}')
+    with pytest.raises(FormatError, match="n_bytes: expected sizes of files: remove"):
+        load_folder(folder)
+
+
+def test_pictures_that_were_removed_after_the_estimate_are_left_out(folder: Path) -> None:
+    """The others are used as long as two are left. Cameras of another program need all their pictures."""
+    said: list[str] = []
+    write_record(folder / "sparse" / "0", EstimateRecord(True))
+    for index in (4, 7):
+        (folder / "images" / f"{index:03d}.png").unlink()
+    capture = load_folder(folder, None, PictureReader(say=said.append))
+    assert len(capture.train.cameras) + len(capture.test.cameras) == 8
+    assert any(
+        text.startswith("2 of 10 pictures whose cameras were estimated are missing (004.png), and the others")
+        for text in said
+    )
+    for index in (0, 1, 2, 3, 5, 6, 8):
+        (folder / "images" / f"{index:03d}.png").unlink()
+    with pytest.raises(
+        DataError, match=r"expected at least 2, got 1 \(000\.png is missing\): remove .*sparse"
+    ):
+        load_folder(folder)
 
 
 def test_a_name_that_leaves_the_folder_is_refused(folder: Path) -> None:

@@ -18,6 +18,7 @@ from player.errors import DataError, FormatError, MissingExtraError, OutputError
 from vfr_bake.data import mapping, poses
 from vfr_bake.data.check.check import check_data
 from vfr_bake.data.features import find_features, match
+from vfr_bake.data.files.estimate_record import read_record
 from vfr_bake.data.folders import load_folder
 from vfr_bake.data.poses import added_since, estimate_cameras, has_pictures
 from vfr_bake.data.store.working import WorkingSize
@@ -97,6 +98,8 @@ def test_the_cameras_are_those_that_are_known(can):
     for turn in turns:
         assert np.degrees(np.arccos(min(1, (np.trace(turn.T @ u @ vt) - 1) / 2))) < 1
     assert report.n_pictures == report.n_registered == N_CAN and report.folder == folder
+    sizes = {path.name: path.stat().st_size for path in folder.glob("*.jpg")}
+    assert read_record(folder / "sparse" / "0").n_bytes == sizes
 
 
 def test_the_report_is_what_colmap_says_of_its_model(can):

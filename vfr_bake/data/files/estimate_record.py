@@ -26,6 +26,8 @@ class EstimateRecord:
     apart: tuple[int, ...] = ()
     """Number of pictures in each further group, whose pictures were placed relative to each other but not to
     the rest."""
+    n_bytes: dict[str, int] = field(default_factory=dict)
+    """Size of each picture's file in bytes, by the picture's name; empty in a record of an older version."""
 
 
 def write_record(model: Path, record: EstimateRecord) -> None:
@@ -55,4 +57,7 @@ def read_record(model: Path) -> EstimateRecord:
     apart = document.get("apart", [])
     if not isinstance(apart, list) or not all(isinstance(number, int) for number in apart):
         raise FormatError(f"{path}: apart: expected numbers of pictures: remove {model} to begin anew")
-    return EstimateRecord(document["upright"], apart=tuple(apart), **told)
+    n_bytes = document.get("n_bytes", {})
+    if not isinstance(n_bytes, dict) or not all(isinstance(number, int) for number in n_bytes.values()):
+        raise FormatError(f"{path}: n_bytes: expected sizes of files: remove {model} to begin anew")
+    return EstimateRecord(document["upright"], apart=tuple(apart), n_bytes=n_bytes, **told)
