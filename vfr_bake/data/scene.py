@@ -124,7 +124,7 @@ def _check_cameras(name: str, cameras: list[Camera]) -> None:
         raise DataError(f"{name}: training views: expected at least 2, got {len(cameras)}")
     places = np.stack([camera.c2w[:3, 3] for camera in cameras])
     spread = float(np.abs(places - places[0]).max())
-    if spread <= 1e-6 * float(np.abs(places).max()) or spread == 0:
+    if spread <= 1e-9 * float(np.abs(places).max()) or spread == 0:
         raise DataError(
             f"{name}: training views: all {len(cameras)} are taken from one place, which tells no depth: "
             "move around the subject"

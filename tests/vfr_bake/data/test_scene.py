@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from player.errors import DataError, ShapeError
+from vfr_bake.config import SceneKind
 from vfr_bake.data.capture import Capture, PosedImages
 from vfr_bake.data.demo import demo_cameras, demo_views
 from vfr_bake.data.scene import NEAR_CAMERA, NEAR_QUANTILE, NEAR_SHARE, WHITE, _near, build_scene
@@ -43,6 +44,19 @@ def test_the_model_frame_does_not_know_the_unit(scale: float):
     np.testing.assert_allclose(
         two.world_from_model, similarity @ one.world_from_model, rtol=1e-5, atol=1e-5 * scale
     )
+
+
+@pytest.mark.parametrize("kind", ["object", "unbounded"])
+def test_a_small_scene_far_from_the_origin_of_its_world(kind: SceneKind):
+    """Positions of georeferenced captures have a northing of millions of metres."""
+    train, test = demo_views(24, 10, 2)
+    place = np.eye(4)
+    place[:3, 3] = [480_000, 5_400_000, 120]
+    far = [PosedImages([c.transformed(place) for c in v.cameras], v.images) for v in (train, test)]
+    here, there = build_scene(Capture("a", train, test), kind), build_scene(Capture("a", *far), kind)
+    for a, b in zip(here.train.cameras, there.train.cameras, strict=True):
+        np.testing.assert_allclose(a.c2w, b.c2w, atol=1e-5)
+    np.testing.assert_allclose(there.world_from_model, place @ here.world_from_model, rtol=0, atol=1e-5)
 
 
 def test_too_few_views():
