@@ -192,7 +192,7 @@ def _views(asset: Asset, options: ExportOptions) -> tuple[list[Camera], list[str
     cameras = asset_cameras(asset) if given is None else read_views(given, (width, height))
     part = options.views or slice(None)
     cameras, names = cameras[part], frame_names(cameras)[part]
-    return ([c.resized(*options.size) for c in cameras] if options.size else cameras), names
+    return ([c.fitted(*options.size) for c in cameras] if options.size else cameras), names
 
 
 def _check_target(asset_path: Path, target: Path, name: str, force: bool) -> bool:

@@ -167,7 +167,7 @@ def _views(asset: Asset, arguments: argparse.Namespace) -> list[Camera]:
         if not -n <= arguments.view < n:
             raise ConfigError(f"--view: expected 0 to {n - 1}, got {arguments.view}")
         cameras = [cameras[arguments.view]]
-    return cameras if arguments.size is None else [camera.resized(*arguments.size) for camera in cameras]
+    return cameras if arguments.size is None else [camera.fitted(*arguments.size) for camera in cameras]
 
 
 def _sentence(path: Path, played: Played) -> str:

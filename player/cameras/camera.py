@@ -70,6 +70,20 @@ class Camera:
             cy=self.cy * sy,
         )
 
+    def fitted(self, width: int, height: int) -> Camera:
+        """Return the view on a grid of `width` x `height` pixels that keep their shape: nothing is lost, and
+        a grid of another aspect ratio shows more at two sides. With the same aspect ratio, of which one side
+        may be rounded to whole pixels, this is `resized`.
+
+        >>> square = Camera("a", np.eye(4), 400, 400, 500.0, 500.0, 200.0, 200.0)
+        >>> wide = square.fitted(1600, 800)
+        >>> wide.fx, wide.fy, wide.cx, wide.cy
+        (1000.0, 1000.0, 800.0, 400.0)
+        """
+        if 2 * abs(width * self.height - height * self.width) <= max(self.width, self.height):
+            return self.resized(width, height)
+        return _fitted(self, width, height)
+
     def at_most(self, longest: int) -> Camera:
         """Return the same view with at most `longest` pixels along each side: this camera itself if it has no
         more.

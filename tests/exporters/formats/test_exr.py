@@ -142,6 +142,12 @@ def test_cameras_of_a_file(shells_asset: Path, tmp_path: Path) -> None:
     arguments = [str(shells_asset), str(target), "--format", "exr", "--views", "4", "--size", "9x7"]
     assert cli.main([*arguments, "--cameras", str(given)]) == 0
     assert [path.name for path in target.iterdir()] == ["r_4.exr"]
+    wide = tmp_path / "wide"
+    assert cli.main([str(shells_asset), str(wide), "--format", "exr", "--views", "4", "--size", "48x20"]) == 0
+    camera = read_cameras(given)[4]
+    with OpenEXR.File(str(wide / "r_4.exr"), separate_channels=True) as file:
+        lens = file.header()["vfr.intrinsics"]
+    assert lens[0].tolist() == [camera.fx / 2, 0, camera.cx / 2 + 12], "nothing is stretched"
 
 
 def test_no_places_where_float32_cannot_hold_them(shells_asset: Path, tmp_path: Path) -> None:

@@ -56,6 +56,16 @@ def test_a_training_view_exactly(asset: Asset, shells_folder: Path, tmp_path: Pa
     assert sorted(path.name for path in tmp_path.iterdir()) == ["last.webp", "view.png"]
 
 
+def test_another_aspect_ratio_stretches_nothing(asset: Asset, shells_folder: Path, tmp_path: Path) -> None:
+    camera = read_cameras(asset.path("cameras.json"))[3]
+    wide = replace(camera, width=96, cx=camera.cx + 24)
+    options = ["--size", "96x40", "--output"]
+    assert cli.main([str(shells_folder), "--view", "3", *options, str(tmp_path / "view.png")]) == 0
+    assert cli.main([*trained(shells_folder), "--frames", "3", *options, str(tmp_path / "file.png")]) == 0
+    for name in ("view.png", "file.png"):
+        assert (pixels(tmp_path / name) == render(asset, wide).to_uint8()).all()
+
+
 @pytest.mark.parametrize("background", ["white", "transparent"])
 def test_webp_and_png_show_the_same(background: str, shells_folder: Path, tmp_path: Path) -> None:
     for form in ("png", "webp"):

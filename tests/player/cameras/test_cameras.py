@@ -123,6 +123,25 @@ def test_resized_keeps_the_view():
     assert (small.width, small.height) == (4, 2)
 
 
+def test_fitted_keeps_the_shape_of_pixels_and_all_that_is_seen():
+    camera = Camera("a", POSE, 8, 6, 9.0, 7.0, 4.5, 2.5)
+    wide = camera.fitted(40, 12)
+    assert (wide.width, wide.height, wide.fx, wide.fy) == (40, 12, 18.0, 14.0)
+    # The corners of the camera's pixels, x = 0 and 8, are x = 12 and 28 of the wide one.
+    np.testing.assert_allclose(
+        (np.array([0, 8]) - camera.cx) / camera.fx, (np.array([12, 28]) - wide.cx) / wide.fx
+    )
+    np.testing.assert_allclose(
+        (np.array([0, 6]) - camera.cy) / camera.fy, (np.array([0, 12]) - wide.cy) / wide.fy
+    )
+    assert camera.fitted(8, 18).fx == camera.fx
+    for size in ((4, 3), (5, 4), (800, 600), (1000, 750), (1001, 751), (8, 6), (37, 28)):
+        same = [
+            (c.width, c.height, c.fx, c.fy, c.cx, c.cy) for c in (camera.fitted(*size), camera.resized(*size))
+        ]
+        assert same[0] == same[1], size
+
+
 def test_transformed_moves_rays_with_the_world():
     camera = Camera("a", POSE, 3, 2, 4.0, 4.0, 1.5, 1.0)
     turn = cv2.Rodrigues(np.array([0.3, -0.5, 0.2]))[0]
