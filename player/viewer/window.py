@@ -355,8 +355,10 @@ class Window:
             if self._closed or self._version != version:
                 return None
             strip = replace(camera, height=min(rows, camera.height - top), cy=camera.cy - top)
+            frame = self._frame(strip, layer)
+            find_normals = _known(frame.normals) if layer == "normals" else None
             # without features: they are not shown, and could take more memory than all the rest
-            frames.append(replace(self._frame(strip, layer), features=None))
+            frames.append(replace(frame, features=None, find_normals=find_normals))
         return layer_picture(_joined(frames, layer), layer)
 
     def _send(self, picture: np.ndarray, quality: int, state: str) -> None:
@@ -379,6 +381,11 @@ def _named(renderers: Sequence[Renderer]) -> dict[str, Renderer]:
     return dict(zip(names, renderers, strict=True))
 
 
+def _known(normals: np.ndarray) -> Callable[[], np.ndarray]:
+    """Return the function of a frame that was put together, whose normals are computed already."""
+    return lambda: normals
+
+
 def _joined(frames: Sequence[Frame], layer: str) -> Frame:
     """Join strips, the uppermost first, to one frame; it has normals if `layer` shows them."""
 
@@ -388,5 +395,5 @@ def _joined(frames: Sequence[Frame], layer: str) -> Frame:
     normals = all_of("normals") if layer == "normals" else None
     return Frame(
         all_of("rgb"), all_of("opacity"), all_of("depth"), all_of("n_density_samples"), frames[0].background,
-        find_normals=None if normals is None else lambda: normals,
+        find_normals=None if normals is None else _known(normals),
     )  # fmt: skip
