@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import asyncio
 import hashlib
+import threading
 from collections.abc import Iterator, Sequence
 from functools import lru_cache
 from pathlib import Path
@@ -28,6 +29,9 @@ POLL_SECONDS = 5
 PATIENCE = 12
 """Polls without any worker after which the cluster counts as gone: they take a minute, within which a worker
 may restart."""
+
+_OPENING = threading.Lock()
+"""Held while a worker opens an asset: its threads begin at once, and would each open it."""
 
 
 def render_on_cluster(
@@ -93,7 +97,9 @@ def _task(job: Job, folder: str, digest: str, n_parts: int, *how: Any) -> Done:
     a whole, because a path in them would not reach a worker of another system."""
     if _digest(Path(folder)) != digest:
         raise IntegrityError(f"{folder}: on a worker: expected the asset of the client, got another")
-    return render_job(_renderer(folder, digest, n_parts, *how), job)
+    with _OPENING:
+        renderer = _renderer(folder, digest, n_parts, *how)
+    return render_job(renderer, job)
 
 
 @lru_cache(maxsize=1)

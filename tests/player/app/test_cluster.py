@@ -6,8 +6,10 @@ import json
 import os
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
@@ -219,6 +221,28 @@ def rendered(asset: Asset, n_frames: int) -> Iterator[Done]:
 def test_workers_need_not_keep_frames_that_have_arrived(asset: Asset, tasks: WeakSet[Task]) -> None:
     """A worker keeps a frame for as long as the client refers to its task."""
     assert [len(tasks) for _ in rendered(asset, 3)] == [3, 2, 1]
+
+
+def test_the_threads_of_a_worker_open_an_asset_once(
+    asset: Asset, tasks: WeakSet[Task], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    opened: list[Path] = []
+    another = threading.Event()
+
+    def opening(folder: Path, **how: Any) -> Asset:
+        opened.append(folder)
+        if len(opened) > 1:
+            another.set()
+        another.wait(1)  # time for the other thread
+        return asset
+
+    monkeypatch.setattr(cluster_module.Asset, "open", opening)
+    where = str(asset.folder), cluster_module._digest(asset.folder), asset.n_parts
+    job = Job(0, orbit(asset_cameras(asset), 1, (16, 12))[0], None, None, "exact", "key", ".png")
+    with ThreadPoolExecutor(2) as pool:
+        done = [pool.submit(cluster_module._task, job, *where, 1, "numpy", None) for _ in range(2)]
+        assert len({each.result().data for each in done}) == 1
+    assert len(opened) == 1
 
 
 def test_a_worker_with_an_incomplete_copy_is_refused(tasks: WeakSet[Task], tmp_path: Path) -> None:
