@@ -20,7 +20,7 @@ from player.progress import Progress
 from vfr_bake.data.capture import Capture, PosedImages, held_out
 from vfr_bake.data.files.estimate_record import read_record
 from vfr_bake.data.files.listing import find_pictures, other_kinds
-from vfr_bake.data.files.masks import mask_of
+from vfr_bake.data.files.masks import mask_of, stray_masks
 from vfr_bake.data.files.opening import SUFFIXES
 from vfr_bake.data.files.orientation import PictureHeader, is_taken_upright, read_layout
 from vfr_bake.data.files.pictures import DescribedView
@@ -76,6 +76,8 @@ def load_transforms_folder(
     else:
         train, test = _listed(document, train_file, train)
     n_train, described = len(train), [*train, *test]
+    if strays := stray_masks(folder, {view.mask for view in described}):
+        reader.say(strays)
     if n_train < 2:
         raise DataError(f"{train_file}: training views: expected at least 2, got {n_train}")
     views = reader.read(described, progress)
@@ -324,6 +326,8 @@ def load_colmap_folder(
             f"{len(replaced)} of {len(registered)} pictures are not those whose cameras were estimated "
             f"({replaced[0]}): remove {folder / 'sparse'} to have the cameras estimated anew"
         )
+    if strays := stray_masks(folder, {view.mask for view in described}):
+        reader.say(strays)
     train, test = held_out(reader.read(described, progress))
     return _capture(folder, described, train, test, points)
 

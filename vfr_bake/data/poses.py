@@ -23,7 +23,7 @@ from vfr_bake.data.files import video
 from vfr_bake.data.files.estimate_record import EstimateRecord, read_record, write_record
 from vfr_bake.data.files.listing import find_pictures, other_kinds, unread_cameras
 from vfr_bake.data.files.looks import Look, look_at
-from vfr_bake.data.files.masks import mask_of
+from vfr_bake.data.files.masks import check_masks, mask_of, stray_masks
 from vfr_bake.data.files.opening import SUFFIXES
 from vfr_bake.data.files.repeats import repeats
 from vfr_bake.data.kept_matches import KeptMatches, stamp
@@ -143,8 +143,8 @@ def estimate_cameras(
     number of its items that are done, and the number of all. The stages are `frames` for a video, then
     `features`, `matches` and `cameras`; then `cameras, attempt 2` and so on if too few of a handful of
     pictures were placed; then `walk`, `turns` and `cameras again` if the model is folded. `say`: called with
-    a sentence if the folder has cameras of a form that is not read, and if the disk refuses to keep features
-    and matches until the end.
+    a sentence if the folder has cameras of a form that is not read or masks of no picture, and if the disk
+    refuses to keep features and matches until the end.
 
     Pictures are turned upright as EXIF says. Those that show what another one shows are left out
     (`vfr_bake.data.files.repeats`). Pictures of one size, and of one maker, model and focal length where EXIF
@@ -185,9 +185,12 @@ def estimate_cameras(
     names = [path.relative_to(place).as_posix() for path in pictures]
     masked = [(path, mask_of(photos, name)) for path, name in zip(pictures, names, strict=True)]
     n_bytes = {name: path.stat().st_size for path, name in zip(pictures, names, strict=True)}
+    masks = [mask for _, mask in masked if mask is not None]
+    if say is not None and (strays := stray_masks(photos, masks)):
+        say(strays)
     known = KeptMatches.of(photos, cache_root(), say)
     looks = look_at(masked, known, lambda done, of: progress("features", done, of))
-    repeated = _repeated(photos, looks)
+    repeated = _repeated(photos, looks, masks)
     kept = [number for number in range(len(names)) if number not in repeated]
     left_out = {names[number]: names[other] for number, other in repeated.items()}
     stamps = [stamp(*masked[number]) for number in kept]
@@ -206,7 +209,8 @@ def estimate_cameras(
     if n_registered < _n_needed(len(names)):
         raise DataError(
             f"{photos}: cameras: expected to find those of at least {_n_needed(len(names))} of "
-            f"{len(names)} pictures, got {n_registered}: {_places(names, pairs)}{ADVICE}"
+            f"{len(names)} pictures, got {n_registered}: {_places(names, pairs)}"
+            f"{_advice(photos, masks, len(pictures))}"
         )
     _turn_upright(models[0])
     placed = _names_in(models[0])
@@ -358,7 +362,20 @@ def _places(names: Sequence[str], pairs: Sequence[Pair]) -> str:
     )
 
 
-def _repeated(photos: Path, looks: Sequence[Look]) -> dict[int, int]:
+def _advice(photos: Path, masks: Sequence[Path], n_pictures: int) -> str:
+    """Return advice for pictures whose cameras were not found. Raises DataError: nearly everything is masked,
+    which is why."""
+    if not masks:
+        return ADVICE
+    if len(masks) == n_pictures:
+        check_masks(str(photos), masks)
+    return (
+        f"{len(masks)} of {n_pictures} pictures have masks: check that these are white where the picture "
+        f"counts and black where it is ignored; otherwise {ADVICE}"
+    )
+
+
+def _repeated(photos: Path, looks: Sequence[Look], masks: Sequence[Path]) -> dict[int, int]:
     """Return the numbers of the pictures that are left out, each with the number of the picture that is kept
     instead. Raises DataError if too few pictures would be left, or too few show anything."""
     n_good = sum(len(look.features.points) >= MIN_FEATURES for look in looks)
@@ -366,7 +383,7 @@ def _repeated(photos: Path, looks: Sequence[Look]) -> dict[int, int]:
         raise DataError(
             f"{photos}: pictures with something to recognise (at least {MIN_FEATURES} features): expected at "
             f"least {_n_needed(len(looks))} of {len(looks)}, got {n_good}: the rest are blank, out of "
-            f"focus or blurred: {ADVICE}"
+            f"focus or blurred: {_advice(photos, masks, len(looks))}"
         )
     repeated = repeats(
         [look.features for look in looks],
@@ -379,7 +396,7 @@ def _repeated(photos: Path, looks: Sequence[Look]) -> dict[int, int]:
         raise DataError(
             f"{photos}: expected pictures from different places, got {len(looks)} times the same"
             + (f" but for {n_left - 1}" if n_left > 1 else "")
-            + f": {ADVICE}"
+            + f": {_advice(photos, masks, len(looks))}"
         )
     return repeated
 

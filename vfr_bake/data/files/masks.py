@@ -8,19 +8,20 @@ of a capture that says that it is masked.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 
 import numpy as np
+from PIL import Image
 
 from player.errors import DataError, FormatError
-from vfr_bake.data.files.opening import open_photograph
+from vfr_bake.data.files.opening import SUFFIXES, open_photograph
 from vfr_bake.data.files.orientation import as_stored, read_layout, turned_upright
 
 FOLDER = "masks"
 SEEN = 128
 """Level of a mask from which on a pixel counts as seen. Masks that a program has resampled or packed as JPEG
-have greys."""
+have greys. If no level is above 1, the mask is of labels, 0 and 1, and 1 is seen."""
 
 
 def mask_of(root: Path, picture: str) -> Path | None:
@@ -44,6 +45,44 @@ def mask_of(root: Path, picture: str) -> Path | None:
     return None
 
 
+def stray_masks(root: Path, used: Collection[Path | None]) -> str | None:
+    """Return a sentence on the pictures in the folder `masks/` of the data set in `root` that are masks of
+    none of its pictures; None if there are none. `used`: masks that are known to belong to a picture.
+
+    >>> stray_masks(Path("surely/not/there"), []) is None
+    True
+    """
+    folder = root / FOLDER
+    masks = sorted(path for path in folder.rglob("*") if _is_picture(path))
+    strays = [path for path in masks if path not in used]
+    pictures = {path.parent: _names_beside(root, path.parent.relative_to(folder)) for path in strays}
+    # Where file names may be in small or capital letters alike, `a.PNG` is a mask, too.
+    strays = [
+        path
+        for path in strays
+        if path.stem not in pictures[path.parent] or not path.with_suffix(".png").is_file()
+    ]
+    if not strays:
+        return None
+    first = strays[0].relative_to(folder).as_posix()
+    return (
+        f"{len(strays)} of {len(masks)} masks belong to no picture ({first}): masks/NAME.png belongs to "
+        "NAME.jpg"
+    )
+
+
+def _names_beside(root: Path, inside: Path) -> set[str]:
+    """Return the names, with and without suffix, of the pictures whose masks are in the folder `inside` of
+    `masks/`."""
+    places = [place for place in (root / "images" / inside, root / inside) if place.is_dir()]
+    found = [path for place in places for path in place.iterdir() if _is_picture(path)]
+    return {name for path in found for name in (path.name, path.stem)}
+
+
+def _is_picture(path: Path) -> bool:
+    return path.suffix.lower() in SUFFIXES and path.name[0] != "." and path.is_file()
+
+
 def apply_mask(rgba: np.ndarray, picture: Path, mask: Path, upright: bool) -> np.ndarray:
     """Return the picture, [height, width, 4] uint8, transparent where its mask is black.
 
@@ -60,7 +99,7 @@ def apply_mask(rgba: np.ndarray, picture: Path, mask: Path, upright: bool) -> np
                     f"{mask}: mask: expected {width}x{height} pixels as {picture.name} has, got "
                     f"{file.size[0]}x{file.size[1]}: save it in the size of its picture, or remove it"
                 )
-            seen = np.asarray(file.convert("L")) >= SEEN
+            seen = _seen(file)
     except FormatError as error:
         raise DataError(str(error)) from error
     if seen.shape != rgba.shape[:2]:
@@ -70,11 +109,33 @@ def apply_mask(rgba: np.ndarray, picture: Path, mask: Path, upright: bool) -> np
     return masked
 
 
+def _seen(mask: Image.Image) -> np.ndarray:
+    """Return which pixels [height, width] of an opened mask count as seen."""
+    levels = np.asarray(mask.convert("L"))
+    return levels >= (1 if levels.max() == 1 else SEEN)
+
+
+def check_masks(name: str, masks: Sequence[Path]) -> None:
+    """Raise DataError unless at least a hundredth of all pixels of the masks counts as seen."""
+    n_seen = n_all = 0
+    for path in masks:
+        try:
+            with open_photograph(path) as file:
+                seen = _seen(file)
+        except FormatError as error:
+            raise DataError(str(error)) from error
+        n_seen, n_all = n_seen + int(seen.sum()), n_all + seen.size
+    _check_share(name, n_seen, n_all)
+
+
 def check_masked(name: str, images: Sequence[np.ndarray]) -> None:
     """Raise DataError unless at least a hundredth of all pixels of the pictures, [height, width, 4] each, is
     opaque, that is, not masked."""
     n_seen = sum(int((image[..., 3] == 255).sum()) for image in images)
-    n_all = sum(image.shape[0] * image.shape[1] for image in images)
+    _check_share(name, n_seen, sum(image.shape[0] * image.shape[1] for image in images))
+
+
+def _check_share(name: str, n_seen: int, n_all: int) -> None:
     if n_seen < 0.01 * n_all:
         raise DataError(
             f"{name}: masks: expected some of the pictures to be seen, got {n_seen} of {n_all} pixels: a "

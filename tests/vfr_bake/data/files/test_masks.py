@@ -17,7 +17,9 @@ from vfr_bake.config import TrainConfig
 from vfr_bake.data import load_scene
 from vfr_bake.data.demo import demo_views
 from vfr_bake.data.features import find_features
-from vfr_bake.data.files.masks import apply_mask, mask_of
+from vfr_bake.data.files.masks import apply_mask, mask_of, stray_masks
+from vfr_bake.data.poses import estimate_cameras
+from vfr_bake.data.store.reading import PictureReader
 from vfr_bake.training.rays import PixelSampler
 from vfr_bake.training.scores.metrics import score_view
 from vfr_bake.training.trainer import Trainer
@@ -103,6 +105,57 @@ def test_names(tmp_path: Path) -> None:
     for name, mask in {"a.jpg": "a.png", "images/b.jpg": "b.jpg.png", "sub/c.heic": "sub/c.png"}.items():
         assert mask_of(tmp_path, name) == tmp_path / "masks" / mask
     assert mask_of(tmp_path, "d.jpg") is None and mask_of(tmp_path, "../a.jpg") is None
+
+
+def test_masks_that_belong_to_no_picture_are_told_of(tmp_path: Path) -> None:
+    for name in ("images/a.jpg", "images/b.JPG", "sub/c.heic", "d.jpg"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_bytes(b"")
+    (tmp_path / "masks" / "sub").mkdir(parents=True)
+    for name in ("a.png", "b.JPG.png", "sub/c.png", ".d.png", "notes.txt", "other.png"):
+        (tmp_path / "masks" / name).write_bytes(b"")
+    assert stray_masks(tmp_path, {tmp_path / "masks" / "other.png"}) is None
+    for name in ("a_mask.png", "c.png", "d.jpg"):
+        (tmp_path / "masks" / name).write_bytes(b"")
+    assert stray_masks(tmp_path, {tmp_path / "masks" / "other.png"}) == (
+        "3 of 7 masks belong to no picture (a_mask.png): masks/NAME.png belongs to NAME.jpg"
+    )
+
+
+def test_stray_masks_are_told_of_when_pictures_are_read_and_estimated(tmp_path: Path) -> None:
+    folder, said = masked_folder(tmp_path), []
+    (folder / "masks" / "01.png").rename(folder / "masks" / "01_mask.png")
+    load_scene(folder, kind="unbounded", reader=PictureReader(say=said.append))
+    (folder / "transforms.json").unlink()
+    with pytest.raises(DataError, match=r"expected at least .* of 24, got 0"):
+        estimate_cameras(folder, lambda *_: None, said.append)
+    told = [text for text in said if "masks belong to no picture" in text]
+    assert (
+        told == ["1 of 24 masks belong to no picture (01_mask.png): masks/NAME.png belongs to NAME.jpg"] * 2
+    )
+
+
+@pytest.mark.parametrize("share", [1.0, 0.5])
+def test_masks_are_named_where_no_cameras_are_found(tmp_path: Path, share: float) -> None:
+    folder = masked_folder(tmp_path, share)
+    (folder / "transforms.json").unlink()
+    expected = "masks: expected some of the pictures to be seen, got 0 of 24576 pixels: a mask is white where"
+    with pytest.raises(DataError, match=expected if share == 1 else "24 of 24 pictures have masks: check"):
+        estimate_cameras(folder, lambda *_: None)
+
+
+def test_a_mask_of_labels(tmp_path: Path) -> None:
+    """A mask of 0 and 1 is one of labels; 1 in a mask with other levels is nearly black."""
+    Image.new("RGB", (40, 30)).save(tmp_path / "a.png")
+    levels = np.zeros((30, 40), np.uint8)
+    levels[:, 20:] = 1
+    for brightest, expected in ((1, levels == 1), (255, levels > 1)):
+        levels[0, 39] = brightest
+        Image.fromarray(levels).save(tmp_path / "mask.png")
+        masked = apply_mask(
+            np.full((30, 40, 4), 255, np.uint8), tmp_path / "a.png", tmp_path / "mask.png", upright=False
+        )
+        np.testing.assert_array_equal(masked[1:, :, 3] == 255, expected[1:])
 
 
 def test_a_mask_of_the_stored_pixels_of_a_turned_picture(tmp_path: Path) -> None:
