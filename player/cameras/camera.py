@@ -57,6 +57,16 @@ class Camera:
         if not np.isfinite([self.cx, self.cy]).all():
             raise FormatError(f"{self.name}: cx, cy: expected finite numbers, got {self.cx}, {self.cy}")
 
+    def _values(self) -> tuple[object, ...]:
+        lens = self.width, self.height, self.fx, self.fy, self.cx, self.cy
+        return self.name, *lens, *self.c2w.ravel().tolist()
+
+    def __eq__(self, other: object) -> bool:
+        return self._values() == other._values() if isinstance(other, Camera) else NotImplemented
+
+    def __hash__(self) -> int:
+        return hash(self._values())
+
     def resized(self, width: int, height: int) -> Camera:
         """Return the same view on a grid of `width` x `height` pixels."""
         sx, sy = width / self.width, height / self.height

@@ -114,6 +114,15 @@ def test_the_rays_through_some_pixels_are_those_of_all():
     np.testing.assert_array_equal(camera.rays_through(np.arange(9, 20))[1], camera.rays()[1][9:20])
 
 
+def test_cameras_are_equal_by_value():
+    camera = Camera("a", POSE, 8, 6, 9.0, 7.0, 4.5, 2.5)
+    assert camera == replace(camera) and len({camera, replace(camera, c2w=POSE.tolist())}) == 1
+    moved = POSE.copy()
+    moved[0, 3] += 1
+    for other in (replace(camera, c2w=moved), replace(camera, fx=8.0), replace(camera, name="b"), "a"):
+        assert camera != other
+
+
 def test_resized_keeps_the_view():
     camera = Camera("a", POSE, 8, 6, 9.0, 7.0, 4.5, 2.5)
     small = camera.resized(4, 2)
