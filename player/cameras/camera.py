@@ -241,6 +241,7 @@ def orbit(cameras: Sequence[Camera], n_frames: int, size: tuple[int, int] | None
     start = _unit(arms[0] - (arms[0] @ up) * up, np.cross(up, np.eye(3)[np.argmin(np.abs(up))]))
     left = np.cross(up, start)
     first = cameras[0] if size is None else _fitted(cameras[0], *size)
+    n_digits = max(3, len(str(n_frames - 1)))  # the names sort as the views do
     views = []
     for index in range(n_frames):
         azimuth = 2 * np.pi * index / n_frames
@@ -249,7 +250,7 @@ def orbit(cameras: Sequence[Camera], n_frames: int, size: tuple[int, int] | None
         right = _unit(np.cross(up, back), left)
         c2w = np.eye(4)
         c2w[:3, :4] = np.stack([right, np.cross(back, right), back, focus + radius * back], axis=-1)
-        views.append(replace(first, name=f"orbit_{index:03d}", c2w=c2w))
+        views.append(replace(first, name=f"orbit_{index:0{n_digits}d}", c2w=c2w))
     return views
 
 

@@ -439,6 +439,13 @@ def test_orbit_of_a_panorama_is_a_panorama():
         assert abs(view.c2w[2, 2]) < 1e-5
 
 
+def test_names_of_a_long_orbit_sort():
+    camera = looking_at([0, 0, 3], [0, 0, 0], up=(0, 1, 0))
+    for n_frames, last in ((1000, "orbit_999"), (1001, "orbit_1000")):
+        names = [view.name for view in orbit([camera], n_frames)]
+        assert names == sorted(names) and names[-1] == last
+
+
 def test_orbit_refuses_nothing():
     with pytest.raises(FormatError, match="at least one"):
         orbit([], 3)
