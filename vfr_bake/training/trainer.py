@@ -34,6 +34,7 @@ from vfr_bake.training.device_guides import DeviceOccupancyGuide, DeviceProposal
 from vfr_bake.training.gradients import chosen_rays, scale_near_gradients
 from vfr_bake.training.guides import Guide, OccupancyGuide, ProposalGuide
 from vfr_bake.training.length.duration import Duration
+from vfr_bake.training.length.stopwatch import Stopwatch
 from vfr_bake.training.length.witness_errors import WitnessErrors
 from vfr_bake.training.length.witness_loss import WitnessLoss
 from vfr_bake.training.optimiser import (
@@ -124,8 +125,7 @@ class Trainer:
         self._masked = scene.masked
         self.background = None if scene.unbounded and not scene.has_alpha else np.array(scene.background)
         """[3] What is behind the pictures, sRGB in [0, 1]; None if nothing is seen through them."""
-        # Not without alpha: there, only plain pixels of the background show that space is empty. Not on a
-        # GPU: its batches are so large that they have enough detail anyway.
+        # Not without alpha, where only plain background shows that space is empty; a GPU's batches are large.
         self._by_detail = scene.has_alpha and self.device.type == "cpu"
         witnesses = choose_witnesses(scene.train)
         self._keep_apart(witnesses.opaque() if scene.masked else witnesses)
@@ -224,10 +224,10 @@ class Trainer:
 
     def run(self) -> Iterator[StepReport]:
         """Train until the steps or the minutes are over. Raises TrainingError when the loss stays NaN."""
-        begin = time.monotonic() - self.seconds
+        watch = Stopwatch(self.seconds, time.monotonic())
         bad_in_a_row = 0
         for step in range(self.next_step, self.pace.steps):
-            seconds = time.monotonic() - begin
+            seconds = watch.at(time.monotonic())
             self._look(step, seconds)
             progress = self.processes.agree(self.duration.progress(step, seconds))
             if progress >= 1:
@@ -240,7 +240,7 @@ class Trainer:
                     f"lower --network-rate (now {self.pace.network_rate}) "
                     f"or --grid-rate (now {self.pace.grid_rate})"
                 )
-            self.next_step, self.seconds = step + 1, time.monotonic() - begin
+            self.next_step, self.seconds = step + 1, watch.step_ends(time.monotonic())
             yield StepReport(step, progress, loss, n_rays, n_samples, self.seconds)
 
     def _look(self, step: int, seconds: float) -> None:

@@ -109,6 +109,27 @@ def test_the_minutes_end_it(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> No
     assert [report.progress for report in reports] == [second / 30 for second in range(1, 30, 2)]
 
 
+def test_minutes_leave_out_compiling_and_pauses(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The first step compiles for 20 seconds, and the machine sleeps for an hour after the third."""
+    now = 0.0
+    monkeypatch.setattr("vfr_bake.training.trainer.time", SimpleNamespace(monotonic=lambda: now))
+    trainer = Trainer(scene, config(steps=10**6, minutes=0.1, batch_samples=1024))
+    step_of, seconds = trainer._step, {0: 20.0}
+
+    def timed(step: int, progress: float) -> tuple[float, int, int]:
+        nonlocal now
+        now += seconds.get(step, 0.25)
+        return step_of(step, progress)
+
+    monkeypatch.setattr(trainer, "_step", timed)
+    reports = []
+    for report in trainer.run():
+        reports.append(report)
+        now += 3600 if report.step == 2 else 0
+    assert [report.seconds for report in reports[1:3]] == [0.5, 0.75]
+    assert reports[3].seconds == 5.75 and reports[-1].seconds == 6.0, "the hour counts five seconds"
+
+
 def test_a_step_without_a_finite_loss_changes_nothing_and_many_stop(scene: Scene) -> None:
     trainer = Trainer(scene, config())
     with torch.no_grad():
