@@ -31,12 +31,16 @@ unbounded. It is below 1 for objects: the more samples, the more of them share r
 
 def typical_step(ends: list[float]) -> float:
     """Return the seconds that a step takes, from the times in seconds at which at least two steps ended. It
-    is the median, because compiling code in one of the first steps takes as long as hundreds of steps.
+    is the median, because compiling code in one of the first steps takes as long as hundreds of steps; or the
+    mean, if the clock's resolution is too low for a median. It is never 0.
 
     >>> round(typical_step([10.0, 10.01, 14.0, 14.01, 14.02]), 6)
     0.01
+    >>> typical_step([0.0, 0.0, 0.0, 0.0156, 0.0156])
+    0.0039
     """
-    return statistics.median(after - before for before, after in pairwise(ends))
+    median = statistics.median(after - before for before, after in pairwise(ends))
+    return median or max((ends[-1] - ends[0]) / (len(ends) - 1), 1e-9)
 
 
 def grown(n: int, unbounded: bool) -> float:

@@ -14,7 +14,7 @@ from vfr_bake.config import Effort, TrainConfig
 from vfr_bake.data.demo import demo_scene, demo_views
 from vfr_bake.data.witnesses import choose_witnesses
 from vfr_bake.training.length.duration import FIRST_LOOK, GROWTH, Duration
-from vfr_bake.training.length.expectation import expectation
+from vfr_bake.training.length.expectation import expectation, typical_step
 from vfr_bake.training.length.witness_loss import WitnessLoss
 from vfr_bake.training.trainer import Trainer
 
@@ -131,6 +131,12 @@ def test_what_is_expected_is_what_was_reached(
 
 def test_the_expectation_leaves_out_the_time_that_compiling_took() -> None:
     assert "about 1,000 steps in 2 minutes" in expectation(18.0, 90.0, 0.05, 1_000_000, 2.0, False)
+
+
+def test_a_clock_that_moves_on_rarely_still_tells_a_time() -> None:
+    ticks = [16e-3 * (step // 4) for step in range(101)]
+    assert typical_step(ticks) == pytest.approx(4e-3)
+    assert "ms a step" in expectation(18.0, 10.0, typical_step([10.0] * 101), 1000, 10.0, False)
 
 
 def test_efforts_are_minutes_at_most() -> None:
