@@ -34,6 +34,7 @@ from vfr_bake.baking.limits import LOOKUPS
 from vfr_bake.config import BakeConfig
 from vfr_bake.kernels.stored_features import descend, descend_density, padded, slants, weigh
 from vfr_bake.presets import BakeChoice
+from vfr_bake.training.length.expectation import typical_step
 from vfr_bake.training.muon import Muon
 
 N_CALIBRATION = 20_000
@@ -337,16 +338,14 @@ class Steps:
         self._progress, self._seconds = progress, seconds
 
     def __iter__(self) -> Iterator[int]:
-        step, begin = 0, 0.0
+        step, ends = 0, list[float]()
         while step < self.n:
             yield step
             step += 1
-            if step == N_WARM:
-                begin = time.monotonic()
-            elif step == N_WARM + N_TIMED:
-                # Not 0: the resolution of some clocks is only 16 ms.
-                step_seconds = max(time.monotonic() - begin, 1e-9) / N_TIMED
-                self.n = max(int(min(self.n, self._seconds / step_seconds)), step)
+            if N_WARM <= step <= N_WARM + N_TIMED:
+                ends.append(time.perf_counter())  # the monotonic clock of Windows moves on by 16 ms at once
+            if step == N_WARM + N_TIMED:
+                self.n = max(int(min(self.n, self._seconds / typical_step(ends))), step)
             if step % 50 == 0 or step == self.n:
                 self._progress(step, self.n)
 
