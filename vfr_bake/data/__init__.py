@@ -68,7 +68,13 @@ def load_scene(
         capture = load_folder(folder, progress, reader)
     if scale is not None:
         capture = scaled(capture, *scale)
-    return build_scene(capture, kind)
+    scene = build_scene(capture, kind)
+    if kind == "auto" and scene.masked and not capture.masked:
+        reader.say(
+            "less than half of the pictures have transparent pixels: these are masked, and the scene is "
+            "unbounded (--kind object for an object)"
+        )
+    return scene
 
 
 def working_size(config: TrainConfig) -> WorkingSize:
@@ -96,9 +102,10 @@ def reader_as(settings: dict[str, Any]) -> PictureReader:
 def load_scene_as(settings: dict[str, Any], data: str | Path, progress: Progress | None = None) -> Scene:
     """Load the pictures that `data` names in the way in which a training with these `settings` loaded them:
     reduced to the same size, in the same unit, and with transparent pixels masked if the scene was trained as
-    an unbounded one. Models and assets record these settings. The other arguments and the errors are those of
-    `load_scene`."""
-    kind: SceneKind = "unbounded" if settings.get("kind") == "unbounded" else "auto"
+    an unbounded one, and not if it was trained as an object. Models and assets record these settings. The
+    other arguments and the errors are those of `load_scene`."""
+    recorded = settings.get("kind")
+    kind: SceneKind = recorded if recorded in ("object", "unbounded") else "auto"
     reader = reader_as(settings)
     return load_scene(data, progress, kind=kind, scale=settings.get("scale"), reader=reader)
 

@@ -76,7 +76,9 @@ def build_scene(capture: Capture, kind: SceneKind = "auto") -> Scene:
     """
     train, test = capture.train, capture.test
     _check_cameras(capture.name, train.cameras)
-    has_alpha = not capture.masked and not all(train.opaque(number) for number in range(len(train.cameras)))
+    n_views = len(train.cameras)
+    n_transparent = 0 if capture.masked else sum(not train.opaque(number) for number in range(n_views))
+    has_alpha = n_transparent > 0
     some = _spread(train)
     if has_alpha and kind != "unbounded" and not any(image[..., 3].any() for image in train.images):
         raise DataError(
@@ -84,7 +86,9 @@ def build_scene(capture: Capture, kind: SceneKind = "auto") -> Scene:
             "transparent everywhere: save them with their colours, or without transparency"
         )
     plain = None if has_alpha else _plain_border(some)
-    unbounded = kind == "unbounded" or (kind == "auto" and not has_alpha and plain is None)
+    # An object is transparent around it in all its pictures; a few holes say nothing of the others.
+    mostly_opaque = 2 * n_transparent < n_views
+    unbounded = kind == "unbounded" or (kind == "auto" and mostly_opaque and plain is None)
     if unbounded:
         centre, half = _camera_ball(train.cameras)
     else:

@@ -103,6 +103,19 @@ def test_the_kind_of_scene_is_seen_and_can_be_overruled():
     assert build_scene(Capture("alpha", train, test), "unbounded").unbounded
 
 
+def test_a_few_transparent_pixels_do_not_make_an_object():
+    train, test = demo_views(24, 10, 2)
+    around = opaque(train, None)
+    for n_transparent, unbounded in ((1, True), (4, True), (5, False)):
+        images = [image.copy() for image in around.images]
+        for image in images[:n_transparent]:
+            image[3, 4, 3] = 0
+        capture = Capture("a", PosedImages(around.cameras, images), opaque(test, None))
+        scene = build_scene(capture)
+        assert scene.unbounded == scene.masked == unbounded != scene.has_alpha
+        assert build_scene(capture, "object").has_alpha
+
+
 def test_pictures_that_are_transparent_everywhere_are_refused():
     train, test = demo_views(8, 4, 1)
     nothing = PosedImages(train.cameras, [image * np.array([1, 1, 1, 0], np.uint8) for image in train.images])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,7 +15,7 @@ from PIL import Image
 from player.cameras.transforms import write_cameras
 from player.errors import DataError
 from vfr_bake.config import TrainConfig
-from vfr_bake.data import load_scene
+from vfr_bake.data import load_scene, load_scene_as
 from vfr_bake.data.demo import demo_views
 from vfr_bake.data.features import find_features
 from vfr_bake.data.files.masks import apply_mask, mask_of, stray_masks
@@ -82,6 +83,19 @@ def test_a_masked_scene_is_none_with_an_object(tmp_path: Path) -> None:
     """Masks do not make a scene an object: the unmasked parts of the pictures are as opaque as before."""
     scene = load_scene(masked_folder(tmp_path))
     assert scene.masked and not scene.has_alpha
+
+
+def test_a_hole_in_one_picture_is_masked_and_told_of(tmp_path: Path) -> None:
+    folder, said = masked_folder(tmp_path), []
+    shutil.rmtree(folder / "masks")
+    with Image.open(folder / "images" / "03.png") as file:
+        holed = file.convert("RGBA")
+    holed.putpixel((20, 20), (0, 0, 0, 0))
+    holed.save(folder / "images" / "03.png")
+    scene = load_scene(folder, reader=PictureReader(say=said.append))
+    assert scene.unbounded and scene.masked
+    assert [text for text in said if text.startswith("less than half of the pictures have transparent")]
+    assert load_scene_as({"kind": "object"}, folder).has_alpha
 
 
 def test_everything_masked(tmp_path: Path) -> None:
