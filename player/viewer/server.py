@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import io
 import os
 import socket
@@ -201,21 +202,33 @@ def free_port(host: str, asked: int | None) -> int:
     """Return the port that was asked for, or the first free one from PORT on.
 
     Ports are tried here, because the server would look for another port without end. Raises ConfigError if
-    none is free.
+    none is free, or if this machine has no such address.
     """
+    try:
+        family, kind, _, _, address = socket.getaddrinfo(host, asked or PORT, type=socket.SOCK_STREAM)[0]
+    except (OSError, UnicodeError) as error:
+        raise _no_address(host, error) from None
     reason = ""
     for port in [asked] if asked is not None else range(PORT, PORT + PORTS):
         try:
-            family, kind, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
             with socket.socket(family, kind) as trial:
                 if os.name == "posix":  # a port whose last connection has just ended is free
                     trial.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-                trial.bind(address)
+                trial.bind((address[0], port, *address[2:]))
             return port
         except OSError as error:
+            if error.errno == errno.EADDRNOTAVAIL:
+                raise _no_address(host, error) from None
             reason = error.strerror or str(error)
+            if error.errno not in (errno.EADDRINUSE, errno.EACCES):  # another port would not help
+                break
     what = f"--port {asked}" if asked is not None else f"ports {PORT} to {PORT + PORTS - 1}"
     raise ConfigError(f"viewer: {what} at {host}: expected a free port, got: {reason}")
+
+
+def _no_address(host: str, error: OSError | UnicodeError) -> ConfigError:
+    reason = getattr(error, "strerror", None) or str(error)
+    return ConfigError(f"--host: expected an address of this machine, got {printable(host)}: {reason}")
 
 
 def _need_viser(asset: Asset) -> None:

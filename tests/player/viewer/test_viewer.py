@@ -138,10 +138,24 @@ def test_a_port_that_is_taken() -> None:
     assert 8080 <= free_port("127.0.0.1", None) < 8180
 
 
+def test_a_host_is_looked_up_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[str] = []
+
+    def unknown(host: str, *_: Any, **__: Any) -> Any:
+        asked.append(host)
+        raise socket.gaierror(socket.EAI_NONAME, "Name or service not known")
+
+    monkeypatch.setattr(socket, "getaddrinfo", unknown)
+    message = "--host: expected an address of this machine, got nowhere.example: Name or service not known"
+    with pytest.raises(ConfigError, match=message):
+        free_port("nowhere.example", None)
+    assert asked == ["nowhere.example"]
+
+
 def test_an_address_of_another_machine(shells_folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """An address of another machine is refused at once; the server itself would try ports without end."""
     assert cli.main([str(shells_folder), "--host", "192.0.2.1", "--port", "8080"]) == 1
-    assert "viewer: --port 8080 at 192.0.2.1: expected a free port, got: " in capsys.readouterr().err
+    assert "--host: expected an address of this machine, got 192.0.2.1: " in capsys.readouterr().err
     assert cli.main([str(shells_folder), "--background", "transparent"]) == 1
     assert "expected a colour for the viewer" in capsys.readouterr().err
 
