@@ -143,8 +143,8 @@ def estimate_cameras(
     number of its items that are done, and the number of all. The stages are `frames` for a video, then
     `features`, `matches` and `cameras`; then `cameras, attempt 2` and so on if too few of a handful of
     pictures were placed; then `walk`, `turns` and `cameras again` if the model is folded. `say`: called with
-    a sentence if the folder has cameras of a form that is not read or masks of no picture, and if the disk
-    refuses to keep features and matches until the end.
+    a sentence if the folder has cameras of a form that is not read or masks of no picture, if a video can
+    be read in part only, and if the disk refuses to keep features and matches until the end.
 
     Pictures are turned upright as EXIF says. Those that show what another one shows are left out
     (`vfr_bake.data.files.repeats`). Pictures of one size, and of one maker, model and focal length where EXIF
@@ -161,7 +161,7 @@ def estimate_cameras(
     MissingExtraError.
     """
     if is_video(photos):
-        photos = video.extract_frames(photos, lambda done, of: progress("frames", done, of))
+        photos = video.extract_frames(photos, lambda done, of: progress("frames", done, of), say)
     if not photos.is_dir():
         found = "a file of another kind" if photos.exists() else "nothing"
         raise DataError(f"{photos}: expected a folder of pictures or a video, got {found}")

@@ -132,14 +132,15 @@ def check_data(
         size: the working size.
         seconds: about how long to look; if the time is over before all pictures are seen, those seen are a
             sample.
-        progress: called with the number of pictures seen and to see.
+        progress: called with the number of pictures seen and to see, and before that, of the files of a ZIP
+            that are unpacked, or the frames of a video that are read.
         most: number of pictures to look at, at most.
 
     Raises DataError, FormatError: there is no such folder, or no picture in it. ConfigError: the built-in
     scene has no pictures. MissingExtraError: a package that reads pictures is missing.
     """
     begin = time.monotonic()
-    pictures = _listed(data)
+    pictures = _listed(data, progress or (lambda done, of: None))
     looks = look_at(pictures.paths, 0.8 * seconds, progress, most)
     seen = [look if isinstance(look, PictureMeasures) else None for look in looks]
     shared = compare(seen, 0.2 * seconds)
@@ -174,14 +175,14 @@ def check_data(
     )
 
 
-def _listed(data: str) -> _Set:
+def _listed(data: str, progress: Progress) -> _Set:
     folder = Path(data)
     if data == "demo":
         raise ConfigError("demo: expected a folder of pictures or a video to check, got the built-in scene")
     if is_archive(folder):
-        folder = unpack(folder, lambda done, of: None)
+        folder = unpack(folder, progress)
     if is_video(folder):
-        folder = extract_frames(folder, lambda done, of: None)
+        folder = extract_frames(folder, progress)
     model = colmap_folder(folder) if folder.is_dir() else None
     if folder.is_dir() and (has_transforms(folder) or model is not None):
         reader = _Describing()

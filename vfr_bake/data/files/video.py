@@ -9,6 +9,7 @@ an hour takes no more memory and no more disk than one of a minute.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -21,13 +22,15 @@ from player.progress import Progress
 from vfr_bake.data.files.pictures import opencv, sharpness, shrunk
 from vfr_bake.data.files.source import check_source, note_source
 
-SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
+SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".3gp", ".mts")
 STEP = 0.03
 """Movement of the picture in the shortest stretch, as a share of its longer side. A step of 4.5 degrees
 around a subject moves the picture by some 0.05."""
 MOST_FRAMES = 160
 """Number of frames at most, twice as many as are enough for a walk around a subject. If there are more, every
 two stretches become one."""
+MIN_READ = 0.9
+"""Share of the frames that the header counts, which is a guess, that must be readable in a whole video."""
 MAX_SIDE = 1920
 """Pixels of the longer side to which frames are reduced: a video's compression leaves nothing finer, and 160
 frames of 4K are 5 GB."""
@@ -44,13 +47,13 @@ def frames_folder(video: Path) -> Path:
     return video.with_name(f"{video.stem}_frames")
 
 
-def extract_frames(video: Path, progress: Progress) -> Path:
+def extract_frames(video: Path, progress: Progress, say: Callable[[str], object] | None = None) -> Path:
     """Write at most `MOST_FRAMES` frames of `video` as JPEG files into `<stem>_frames/images/` beside it.
 
     Each is the sharpest of a stretch in which the picture has moved by the same share of its size, because a
     hand-held camera shakes, and one frame in three is blurred. `progress`: called with the number of frames
-    looked at and to look at. The folder appears when it is complete; one that was made before is used as it
-    is. Returns the folder.
+    looked at and to look at. `say`: called with a sentence if many frames cannot be read. The folder appears
+    when it is complete; one that was made before is used as it is. Returns the folder.
 
     Raises DataError (not a video, no frames, a folder with the frames of another video), OutputError,
     MissingExtraError.
@@ -80,6 +83,11 @@ def extract_frames(video: Path, progress: Progress) -> Path:
             stretches.finish()
             progress(n_read, n_read)
             note_source(new, video)
+        if say is not None and n_read < MIN_READ * n_frames:
+            say(
+                f"{n_read} of about {n_frames} frames of {video.name} could be read: the file may be "
+                f"damaged: copy it again, and remove {folder}"
+            )
     finally:
         capture.release()
     return folder

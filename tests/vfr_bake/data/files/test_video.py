@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -12,8 +13,10 @@ from PIL import Image
 from player.errors import DataError
 from tests.vfr_bake.data.test_poses import message, quiet, textured
 from vfr_bake.data import poses
+from vfr_bake.data.check.check import check_data
 from vfr_bake.data.files import video
 from vfr_bake.data.poses import estimate_cameras, is_video
+from vfr_bake.data.store.working import WorkingSize
 
 
 def write_video(path: Path, shifts: list[float], blurred: set[int] = frozenset()) -> Path:
@@ -87,6 +90,36 @@ def test_an_interrupted_video_leaves_nothing(short_video: Path):
     with pytest.raises(KeyboardInterrupt):
         video.extract_frames(short_video, interrupt)
     assert list(short_video.parent.iterdir()) == [short_video]
+
+
+@pytest.mark.parametrize(("counted", "told"), [(13, False), (14, True)])
+def test_a_video_that_ends_early_is_told_of(
+    short_video: Path, monkeypatch: pytest.MonkeyPatch, counted: int, told: bool
+):
+    """The header of a video of 12 frames counts 13, as a guess may, or 14, of which 12 are too few."""
+
+    whole = cv2.VideoCapture
+
+    def with_count(path: str) -> SimpleNamespace:
+        capture = whole(path)
+        return SimpleNamespace(
+            get=lambda key: counted, isOpened=capture.isOpened, read=capture.read, release=capture.release
+        )
+
+    monkeypatch.setattr(cv2, "VideoCapture", with_count)
+    said: list[str] = []
+    folder = video.extract_frames(short_video, lambda done, of: None, said.append)
+    expected = (
+        "12 of about 14 frames of walk.avi could be read: the file may be damaged: copy it again, and remove "
+        + str(folder)
+    )
+    assert said == ([expected] if told else [])
+
+
+def test_the_check_of_a_video_reports_its_frames(short_video: Path):
+    calls: list[tuple[int, int]] = []
+    check_data(str(short_video), WorkingSize(), 60.0, lambda *call: calls.append(call))
+    assert (12, 12) in calls
 
 
 def test_a_file_that_is_no_video(tmp_path: Path, capfd: pytest.CaptureFixture[str]):
