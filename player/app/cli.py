@@ -59,7 +59,7 @@ def _run(arguments: argparse.Namespace) -> int:
 def _view(arguments: argparse.Namespace) -> int:
     from player.asset.asset import Asset
     from player.render import import_ahead
-    from player.viewer.server import ServeSettings, serve
+    from player.viewer.server import ServeSettings, address_for_others, serve
 
     settings = settings_of(ServeSettings, arguments)
     import_ahead()
@@ -67,7 +67,7 @@ def _view(arguments: argparse.Namespace) -> int:
     assets = [Asset.growing(folder, max_memory=arguments.max_memory) for folder in folders]
     with serve(assets, settings, _say) as address:
         print(f"{arguments.asset}: look at it at {address}", flush=True)
-        _advise(arguments.asset, address)
+        _advise(arguments.asset, address, address_for_others(settings.host, address))
         forever = threading.Event()
         while not forever.wait(1):  # on Windows, Ctrl-C does not interrupt a wait without a timeout
             pass
@@ -101,15 +101,19 @@ def _open(folder: Path, arguments: argparse.Namespace) -> Asset:
     return asset
 
 
-def _advise(asset: Path, address: str) -> None:
-    """Say how to end the viewer, and what to do if no browser can open on this machine."""
-    _say(f"for many visitors, each with the GPU of their own device: {address}/page")
+def _advise(asset: Path, address: str, visitors: str) -> None:
+    """Say how to end the viewer, and what to do if no browser can open on this machine.
+
+    `address`, `visitors`: where browsers of this machine and of others find the viewer.
+    """
+    _say(f"for many visitors, each with the GPU of their own device: {visitors}/page")
     _say("the viewer runs until Ctrl-C")
     if not _has_display():
-        port = address.rpartition(":")[2]
-        _say(f"no display here: from a machine that has one, ssh -L {port}:127.0.0.1:{port} to this")
+        place = address.removeprefix("http://")
+        port = place.rpartition(":")[2]
+        _say(f"no display here: from a machine that has one, ssh -L {port}:{place} to this")
         files = command_line("vfr-play", str(asset), "--orbit", "60", "--output", "frames/")
-        _say(f"and open that address there; or render files: {files}")
+        _say(f"and open http://127.0.0.1:{port} there; or render files: {files}")
 
 
 def _has_display() -> bool:

@@ -293,6 +293,11 @@ def _logger() -> logging.Logger:
     return logger
 
 
+def own_name() -> str | None:
+    """Return this machine's name, in lower case; None if no browser could ask for it."""
+    return _name(socket.gethostname())
+
+
 def _only(headers: Headers, name: str) -> str | None:
     values = headers.get_all(name)
     return values[0] if len(values) == 1 else None

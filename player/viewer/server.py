@@ -30,6 +30,8 @@ from player.viewer.window import PictureChoices, Window
 PORT = 8080
 PORTS = 100
 """Number of ports, from PORT on, that are tried where none was asked for."""
+EVERY_ADDRESS = ("0.0.0.0", "::")
+"""The hosts that stand for all addresses of this machine."""
 
 
 @dataclass(frozen=True)
@@ -127,6 +129,15 @@ def serve(
             pages.close()
             with redirect_stdout(io.StringIO()):
                 server.stop()
+
+
+def address_for_others(host: str, address: str) -> str:
+    """Return the address by which other machines reach the viewer at `host`, which this machine reaches by
+    `address`: another one if the viewer serves at every address of this machine."""
+    from player.viewer.guard import own_name
+
+    name = own_name() if host in EVERY_ADDRESS else None
+    return address if name is None else f"http://{name}:{address.rpartition(':')[2]}"
 
 
 def guarded_server(host: str, port: int, title: str = "", pages: Pages = NO_PAGES) -> Any:
@@ -244,6 +255,6 @@ def _need_viser(asset: Asset) -> None:
 
 def _shown(host: str) -> str:
     """Return the host for an address by which a browser on this machine reaches the viewer."""
-    if host in ("0.0.0.0", "::"):
+    if host in EVERY_ADDRESS:
         return "127.0.0.1"
     return f"[{host}]" if ":" in host else host

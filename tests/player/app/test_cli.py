@@ -200,12 +200,22 @@ def test_commands_that_are_printed_can_be_typed(
     assert cli.main([str(folder)]) == 1
     printed += capsys.readouterr().err
     monkeypatch.setattr(cli, "_has_display", lambda: False)
-    cli._advise(folder, "http://127.0.0.1:8080")
+    cli._advise(folder, "http://127.0.0.1:8080", "http://127.0.0.1:8080")
     printed += capsys.readouterr().err
     typed = re.findall(r"vfr-play ([/'\"].*)", printed)
     assert [shlex.split(words)[:2] for words in typed] == [
         [str(folder)], *[[str(folder), "--orbit"]] * 3
     ]  # fmt: skip
+
+
+def test_the_tunnel_ends_where_the_viewer_listens(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(cli, "_has_display", lambda: False)
+    for place in ("127.0.0.1:8080", "192.168.1.5:8080", "[::1]:8080"):
+        cli._advise(Path("out"), f"http://{place}", f"http://{place}")
+        said = capsys.readouterr().err
+        assert f"ssh -L 8080:{place} to this" in said and "open http://127.0.0.1:8080 there" in said
 
 
 def test_check(broken_folder: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -31,7 +31,7 @@ from player.render import Renderer
 from player.viewer import window as window_module
 from player.viewer.layers import LAYERS, layer_picture
 from player.viewer.resolution import FRAME_SECONDS, LEAST, SHARE, SHARP_SECONDS, STILL_SECONDS, Pace, fitted
-from player.viewer.server import ServeSettings, free_port, serve
+from player.viewer.server import ServeSettings, address_for_others, free_port, serve
 from player.viewer.window import Window
 from tests.player.conftest import write_shells
 from tests.player.viewer.viewer_client import SECONDS, Server
@@ -158,6 +158,17 @@ def test_an_address_of_another_machine(shells_folder: Path, capsys: pytest.Captu
     assert "--host: expected an address of this machine, got 192.0.2.1: " in capsys.readouterr().err
     assert cli.main([str(shells_folder), "--background", "transparent"]) == 1
     assert "expected a colour for the viewer" in capsys.readouterr().err
+
+
+def test_visitors_are_told_an_address_that_leads_to_this_machine(monkeypatch: pytest.MonkeyPatch) -> None:
+    here = "http://127.0.0.1:9000"
+    monkeypatch.setattr(socket, "gethostname", lambda: "Workstation.example")
+    for host in ("0.0.0.0", "::"):
+        assert address_for_others(host, here) == "http://workstation.example:9000"
+    assert address_for_others("127.0.0.1", here) == here
+    assert address_for_others("::1", "http://[::1]:9000") == "http://[::1]:9000"
+    monkeypatch.setattr(socket, "gethostname", lambda: "no name of a page")
+    assert address_for_others("0.0.0.0", here) == here
 
 
 def test_a_program_serves_as_the_command_does(asset: Asset, capfd: pytest.CaptureFixture[str]) -> None:
