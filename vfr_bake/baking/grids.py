@@ -55,7 +55,8 @@ as the quantile that leaves out this share."""
 LEAST_SENSITIVITY = 1e-6
 """Least eigenvalue of M, as a share of their mean: smaller ones are raised to it, so that S has an
 inverse."""
-
+RAYS_DERIVED = 8192
+"""Rays at once at which the head is differentiated: each holds the activations of all layers."""
 
 Parts = Iterable[tuple[slice, np.ndarray]]
 """A table part by part: pairs of a slice of rows and the values [n, n_columns] in them."""
@@ -302,12 +303,14 @@ def head_sensitivity(
 ) -> np.ndarray:
     """Return M [n_channels, n_channels], the mean square of the derivatives of the shown colours, at the
     `rendered` features [n, n_channels] seen along `dirs` [n, 3] with `opacity` [n]."""
-    features = torch.from_numpy(rendered).requires_grad_(True)
-    colours = head(features, torch.from_numpy(dirs)) * torch.from_numpy(opacity)[:, None]
     total = np.zeros((rendered.shape[1],) * 2)
-    for channel in range(3):
-        (gradient,) = torch.autograd.grad(colours[:, channel].sum(), features, retain_graph=channel < 2)
-        total += gradient.double().numpy().T @ gradient.double().numpy()
+    for first in range(0, len(rendered), RAYS_DERIVED):
+        some = slice(first, first + RAYS_DERIVED)
+        features = torch.from_numpy(rendered[some]).requires_grad_(True)
+        colours = head(features, torch.from_numpy(dirs[some])) * torch.from_numpy(opacity[some])[:, None]
+        for channel in range(3):
+            (gradient,) = torch.autograd.grad(colours[:, channel].sum(), features, retain_graph=channel < 2)
+            total += gradient.double().numpy().T @ gradient.double().numpy()
     return total / max(len(rendered), 1)
 
 

@@ -11,8 +11,10 @@ from player.asset.bricks import unpack_vertices
 from player.progress import silent
 from vfr_bake.baking.cells import Resolutions, corners_of, occupied_cells, subdivided
 from vfr_bake.baking.grids import (
+    RAYS_DERIVED,
     _corners,
     evaluate_densities,
+    head_sensitivity,
     latent_features,
     make_layout,
     unit_points,
@@ -80,3 +82,21 @@ def test_vertices_are_put_in_order_slab_by_slab(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr("vfr_bake.baking.grids.SLAB", 64)
     for slabs, whole in zip(vars(vertices).values(), vars(_corners(cells, 110)).values(), strict=True):
         assert np.array_equal(slabs, whole)
+
+
+def test_the_head_is_differentiated_at_a_few_rays_at_once(model: Model) -> None:
+    random, n = np.random.default_rng(0), RAYS_DERIVED + 1000
+    features = random.normal(size=(n, model.field.config.n_channels)).astype(np.float32)
+    dirs = random.normal(size=(n, 3)).astype(np.float32)
+    dirs /= np.linalg.norm(dirs, axis=1, keepdims=True)
+    opacity = random.random(n).astype(np.float32)
+    at_once: list[int] = []
+    hook = model.field.head.register_forward_hook(lambda _, given, __: at_once.append(len(given[0])))
+    together = head_sensitivity(model.field.head, features, dirs, opacity)
+    hook.remove()
+    assert at_once == [RAYS_DERIVED, 1000]
+    parts = [
+        len(features[part]) * head_sensitivity(model.field.head, features[part], dirs[part], opacity[part])
+        for part in (slice(0, 500), slice(500, 4000), slice(4000, RAYS_DERIVED), slice(RAYS_DERIVED, n))
+    ]
+    np.testing.assert_allclose(together, sum(parts) / n, rtol=1e-3, atol=1e-6 * np.abs(together).max())
