@@ -173,7 +173,13 @@ def _camera_ball(cameras: list[Camera]) -> tuple[np.ndarray, float]:
     centre = focus_point(cameras)
     if np.linalg.norm(centre - middle) > 20 * spread:
         centre = middle  # nearly parallel views have no focus point that can be used
-    return centre, float(np.quantile(np.linalg.norm(places - centre, axis=1), CAMERA_QUANTILE))
+    n_views, distances = len(places), np.sort(np.linalg.norm(places - centre, axis=1))
+    radius = float(np.quantile(distances, CAMERA_QUANTILE))
+    # Of few cameras, the quantile lies between the last two, so that one that strayed would count. But where
+    # all others are in one place, it did not stray.
+    if CAMERA_QUANTILE * (n_views - 1) > n_views - 2 > 0 and distances[-2] > 1e-3 * radius:
+        radius = float(distances[-2])
+    return centre, radius
 
 
 def _near(cameras: list[Camera], points: np.ndarray | None, unit: float) -> float:

@@ -52,8 +52,8 @@ def test_a_small_scene_far_from_the_origin_of_its_world(kind: SceneKind):
     train, test = demo_views(24, 10, 2)
     place = np.eye(4)
     place[:3, 3] = [480_000, 5_400_000, 120]
-    far = [PosedImages([c.transformed(place) for c in v.cameras], v.images) for v in (train, test)]
-    here, there = build_scene(Capture("a", train, test), kind), build_scene(Capture("a", *far), kind)
+    far = PosedImages([camera.transformed(place) for camera in train.cameras], train.images)
+    here, there = (build_scene(Capture("a", views, test), kind) for views in (train, far))
     for a, b in zip(here.train.cameras, there.train.cameras, strict=True):
         np.testing.assert_allclose(a.c2w, b.c2w, atol=1e-5)
     np.testing.assert_allclose(there.world_from_model, place @ here.world_from_model, rtol=0, atol=1e-5)
@@ -137,6 +137,29 @@ def test_an_unbounded_scene_has_its_cameras_in_the_unit_ball():
     points = np.stack([eye[:3, 3] - eye[:3, 2] * depth for depth in (0.2, 0.3)])
     near = build_scene(Capture("a", train, test, points=points), "unbounded").near
     assert 0.05 < near * scene.world_from_model[0, 0] < 0.2  # half of the least depths, 0.2 and 0.3
+
+
+@pytest.mark.parametrize("n_views", [3, 8, 10, 11, 30])
+def test_one_camera_that_strayed_does_not_shrink_the_rest(n_views: int):
+    train, test = demo_views(8, n_views, 1)
+    unit = build_scene(Capture("a", train, test), "unbounded").world_from_model[0, 0]
+    pose = train.cameras[0].c2w.copy()
+    pose[:3, 3] += 50 * unit * pose[:3, 2]  # along its axis, so that it looks at the same point
+    strayed = PosedImages([replace(train.cameras[0], c2w=pose), *train.cameras[1:]], train.images)
+    found = build_scene(Capture("a", strayed, test), "unbounded").world_from_model[0, 0]
+    assert 0.8 * unit < found < 1.25 * unit
+
+
+def test_three_cameras_at_the_centre_and_one_outside_have_a_ball():
+    train, test = demo_views(8, 4, 1)
+    poses = [np.eye(4) for _ in train.cameras]
+    poses[0][2, 3] = 3.0
+    for pose, angle in zip(poses[1:], (-0.7, 0.0, 0.7), strict=True):
+        pose[0, 0] = pose[2, 2] = np.cos(angle)
+        pose[0, 2], pose[2, 0] = np.sin(angle), -np.sin(angle)
+    turned = [replace(camera, c2w=pose) for camera, pose in zip(train.cameras, poses, strict=True)]
+    scene = build_scene(Capture("a", PosedImages(turned, train.images), test), "unbounded")
+    assert max(np.linalg.norm(c.c2w[:3, 3]) for c in scene.train.cameras) < 10
 
 
 def test_many_points_take_little_memory_and_tell_the_same():
