@@ -16,6 +16,7 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 from player.errors import DataError, OutputError
 from player.files.files import new_folder
 from player.progress import Progress
+from vfr_bake.data.files.listing import named_kinds
 from vfr_bake.data.files.opening import SUFFIXES
 from vfr_bake.data.files.source import check_source, note_source
 
@@ -106,7 +107,11 @@ def _checked(archive: Path, file: zipfile.ZipFile) -> list[tuple[zipfile.ZipInfo
     if any(entry.flag_bits & 1 for entry, _ in entries):
         raise DataError(f"{archive}: ZIP: expected one without a password: unpack it, and name the folder")
     if not entries:
-        raise DataError(f"{archive}: ZIP: expected pictures ({', '.join(SUFFIXES)}) in it, got none")
+        names = [PurePosixPath(_decoded(entry)) for entry in file.infolist()]
+        raise DataError(
+            f"{archive}: ZIP: expected pictures ({', '.join(SUFFIXES)}) in it, got none"
+            f"{named_kinds(names, 'unpack it, and name it')}"
+        )
     (name, times), *_ = Counter(str(name).casefold() for _, name in entries).most_common(1)
     if times > 1:
         raise DataError(f"{archive}: ZIP: expected different names, got {name} {times} times")

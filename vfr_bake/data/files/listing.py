@@ -4,21 +4,31 @@ from __future__ import annotations
 
 import os
 import re
-from pathlib import Path
+from collections.abc import Iterable, Iterator
+from pathlib import Path, PurePath
 
 from player.errors import DataError
+from player.terminal import printable
 from vfr_bake.data.files.masks import FOLDER as MASKS
 from vfr_bake.data.files.opening import SUFFIXES
+from vfr_bake.data.files.source import is_made
+from vfr_bake.data.files.video import SUFFIXES as VIDEOS
 
 MOST = 20_000
 """Number of pictures of one capture at most: more are a whole collection, and not a scene."""
 NOT_PICTURES = (MASKS, "mask", "sparse", "colmap", "__MACOSX", "@eaDir")
 """Folders that are not searched: masks, also where other data sets have them, COLMAP's models, and the
 previews of some systems."""
+PREVIEW = ".preview.png"
+"""End of the names of the previews that a training writes, which may be beside the photographs."""
+RAW = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".rw2", ".orf", ".pef", ".srw")
+UNREAD = (*RAW, ".jxl", ".bmp", ".gif")
+"""Suffixes of pictures of formats that are not read."""
 CAMERAS = ("cameras*.npz", "poses_bounds.npy", "pose/*.txt")
 """Patterns of files in which other data sets have cameras (DTU, LLFF, and NSVF and Tanks and Temples)."""
 OWN = ("transforms.json", "transforms_train.json", "sparse", "manifest.json")
-"""A subfolder that has one of these is a data set or an asset of its own, and is not searched."""
+"""A subfolder that has one of these is a data set or an asset of its own, and is not searched. Nor is one
+that was made from a video or a ZIP."""
 
 
 def find_pictures(folder: Path) -> tuple[Path, list[Path]]:
@@ -40,15 +50,9 @@ def find_pictures(folder: Path) -> tuple[Path, list[Path]]:
 
 def _below(place: Path) -> list[Path]:
     found: list[Path] = []
-    for folder, folders, names in os.walk(place):
-        # Files whose names begin with a dot are left behind by systems (`._a.jpg` is no picture).
-        folders[:] = sorted(
-            name
-            for name in folders
-            if name[0] != "." and name not in NOT_PICTURES and not _is_own(Path(folder, name))
-        )
-        paths = [Path(folder, name) for name in names if name[0] != "."]
-        found += [path for path in paths if path.suffix.lower() in SUFFIXES and path.is_file()]
+    for path in _files(place):
+        if path.suffix.lower() in SUFFIXES and not path.name.endswith(PREVIEW) and path.is_file():
+            found.append(path)
         if len(found) > MOST:
             raise DataError(
                 f"{place}: expected at most {MOST} pictures of one scene, got more: name the folder of those "
@@ -64,8 +68,20 @@ def _below(place: Path) -> list[Path]:
     return found
 
 
+def _files(place: Path) -> Iterator[Path]:
+    """Yield the files in a folder and in those within that are searched."""
+    for folder, folders, names in os.walk(place):
+        # Files whose names begin with a dot are left behind by systems (`._a.jpg` is no picture).
+        folders[:] = sorted(
+            name
+            for name in folders
+            if name[0] != "." and name not in NOT_PICTURES and not _is_own(Path(folder, name))
+        )
+        yield from (Path(folder, name) for name in names if name[0] != ".")
+
+
 def _is_own(folder: Path) -> bool:
-    return any((folder / name).exists() for name in OWN)
+    return any((folder / name).exists() for name in OWN) or is_made(folder)
 
 
 def unread_cameras(folder: Path) -> str | None:
@@ -85,13 +101,22 @@ def _order(name: str) -> list[tuple[int, str]]:
 
 
 def other_kinds(folder: Path) -> str:
-    """Return a clause on the files in a folder that are pictures of formats that are not read; empty if there
-    are none."""
-    kinds = {
-        path.suffix.lower()
-        for place in (folder, folder / "images")
-        if place.is_dir()
-        for path in place.iterdir()
-        if path.suffix.lower() in (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".jxl", ".bmp", ".gif")
-    }
-    return f"; there are {', '.join(sorted(kinds))} files: save them as JPEG" if kinds else ""
+    """Return a clause on the files in a folder, and in those within, that are pictures of formats that are
+    not read or videos; empty if there are none."""
+    return named_kinds((path.relative_to(folder) for path in _files(folder)), "name it")
+
+
+def named_kinds(paths: Iterable[PurePath], cure: str) -> str:
+    """Return a clause on the `paths` of pictures of formats that are not read, and of videos, with the `cure`
+    for these; empty if there are none.
+
+    >>> named_kinds([PurePath("a.NEF"), PurePath("b.nef"), PurePath("walk.MOV")], "name it")
+    '; there are .nef files: save them as JPEG; there is a video, walk.MOV: name it'
+    """
+    told = ""
+    paths = list(paths)
+    if kinds := {path.suffix.lower() for path in paths} & {*UNREAD}:
+        told += f"; there are {', '.join(sorted(kinds))} files: save them as JPEG"
+    if videos := sorted(path.as_posix() for path in paths if path.suffix.lower() in VIDEOS):
+        told += f"; there is a video, {printable(videos[0][:200])}: {cure}"
+    return told

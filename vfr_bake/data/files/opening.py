@@ -18,7 +18,9 @@ from player.errors import FormatError, MissingExtraError
 from player.files.files import open_file
 from player.files.images import MAX_FILE_BYTES, open_picture
 
-SUFFIXES = (".png", ".jpg", ".jpeg", ".heic", ".heif", ".avif", ".webp", ".tif", ".tiff")
+SUFFIXES = (
+    *(".png", ".jpg", ".jpeg", ".jpe", ".jfif", ".heic", ".heif", ".hif", ".avif", ".webp", ".tif", ".tiff"),
+)
 """Suffixes of photographs, in small or capital letters."""
 FORMATS = ("JPEG", "PNG", "AVIF", "WEBP", "TIFF", "BMP")
 """Formats, by Pillow's names, that a photograph may have if it is not HEIC, whatever its file is called."""

@@ -3,9 +3,10 @@ not taken for that of another file."""
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
-from player.errors import DataError
+from player.errors import DataError, FormatError
 from player.files.files import read_bytes
 
 NAME = "source.txt"
@@ -26,6 +27,19 @@ def check_source(folder: Path, source: Path) -> None:
             f"{folder}: expected to be made from {source.name} as it is now, got a folder that was made from "
             "another file: remove it, or name the folder itself to use it"
         )
+
+
+def is_made(folder: Path) -> bool:
+    """Return whether `folder` has a note of what it was made from.
+
+    >>> is_made(Path("surely/not/there"))
+    False
+    """
+    try:
+        note = read_bytes(folder / NAME, "the name of a file", 10_000)
+    except FormatError:
+        return False
+    return re.fullmatch(rb"'.+'\n[0-9]+\n|\".+\"\n[0-9]+\n", note) is not None
 
 
 def _note(source: Path) -> bytes:

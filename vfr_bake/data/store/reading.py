@@ -34,7 +34,7 @@ LEAST_SIDE = 480
 """Pixels: the longest side is not made smaller than this for want of room."""
 STEP = 16
 """Pixels: a side that is made smaller for want of room is a multiple of this."""
-OPAQUE = (".jpg", ".jpeg", ".heic", ".heif", ".hif")
+OPAQUE = (".jpg", ".jpeg", ".jpe", ".jfif", ".heic", ".heif", ".hif")
 """Suffixes of photographs that are expected to have no alpha: three channels are stored."""
 
 

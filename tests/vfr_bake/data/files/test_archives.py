@@ -117,6 +117,18 @@ def with_a_name_that_is_no_utf8(path: Path) -> None:
     path.write_bytes(pack(path, {"\u00fc.png": picture()}).read_bytes().replace(b"\xc3\xbc", b"\xff\xff"))
 
 
+def test_a_zip_of_a_video_says_so(tmp_path: Path) -> None:
+    archive = pack(tmp_path / "a.zip", {"DCIM/walk.MOV": b"x", "DCIM/a.orf": b"x"})
+    with pytest.raises(
+        DataError, match=r"in it, got none; there are \.orf files: save them as JPEG; "
+    ) as caught:
+        unpacked(archive)
+    assert str(caught.value).endswith("; there is a video, DCIM/walk.MOV: unpack it, and name it")
+    with pytest.raises(DataError, match=r"there is a video, a\\nb\.mov") as caught:
+        unpacked(pack(tmp_path / "b.zip", {"a\nb.mov": b"x"}))
+    assert "\n" not in str(caught.value)
+
+
 def damaged(path: Path) -> None:
     data = bytearray(pack(path, {"a.png": bytes(5000)}).read_bytes())
     data[1000] ^= 255

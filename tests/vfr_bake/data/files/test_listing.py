@@ -9,7 +9,8 @@ import pytest
 
 from player.errors import DataError
 from vfr_bake.data.files import listing
-from vfr_bake.data.files.listing import find_pictures, unread_cameras
+from vfr_bake.data.files.listing import find_pictures, other_kinds, unread_cameras
+from vfr_bake.data.files.source import note_source
 
 
 def touch(folder: Path, *names: str) -> None:
@@ -30,6 +31,28 @@ def test_folders_within_the_folder(tmp_path: Path) -> None:
     )
     touch(tmp_path, "other/transforms.json", "other/g.png", "out/manifest.json", "out/h.png")
     assert names(tmp_path) == ["a.webp", "DCIM/100/IMG_9.heic", "DCIM/100/IMG_10.HEIC", "DCIM/101/IMG_2.jpg"]
+
+
+def test_suffixes_that_programs_and_cameras_write(tmp_path: Path) -> None:
+    touch(tmp_path, "1.hif", "2.JFIF", "3.jpe")
+    assert names(tmp_path) == ["1.hif", "2.JFIF", "3.jpe"]
+
+
+def test_what_was_written_beside_the_photographs_is_none(tmp_path: Path) -> None:
+    touch(tmp_path, "1.jpg", "walk.mp4", "walk_frames/images/0000.jpg", "garden.preview.png", "b/2.jpg")
+    note_source(tmp_path / "walk_frames", tmp_path / "walk.mp4")
+    (tmp_path / "b" / "source.txt").write_text("photographs of a friend")
+    assert names(tmp_path) == ["1.jpg", "b/2.jpg"]
+    assert names(tmp_path / "walk_frames") == ["0000.jpg"]
+
+
+def test_videos_and_raw_files_are_named_wherever_they_are(tmp_path: Path) -> None:
+    touch(tmp_path, "DCIM/100/a.RW2", "DCIM/walk.MOV", "DCIM/other.mov", "masks/b.dng", "c.txt")
+    assert other_kinds(tmp_path) == (
+        "; there are .rw2 files: save them as JPEG; there is a video, DCIM/other.mov: name it"
+    )
+    assert other_kinds(tmp_path / "masks") == "; there are .dng files: save them as JPEG"
+    assert other_kinds(tmp_path / "none") == ""
 
 
 def test_images_come_first(tmp_path: Path) -> None:
