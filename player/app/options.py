@@ -4,6 +4,7 @@ together."""
 from __future__ import annotations
 
 import argparse
+import math
 import sys
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -21,6 +22,7 @@ from player.app.option_types import (
     whole,
 )
 from player.errors import ConfigError
+from player.files.json_files import brief
 
 PICTURES = (".png", ".webp")
 VIDEO = ".mp4"
@@ -68,7 +70,7 @@ class PlaySettings:
     """Settings of `player.play`: what it renders, besides the asset and the cameras, and where it writes
     pictures.
 
-    Raises ConfigError for settings that contradict each other.
+    Raises ConfigError for settings that are out of range or contradict each other.
 
     >>> PlaySettings(Path("turn.mp4"), background="transparent")
     Traceback (most recent call last):
@@ -103,6 +105,7 @@ class PlaySettings:
     """Gigabytes that the asset may take on a worker of a cluster; half of its machine's if None."""
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "fps", _frame_rate(self.fps))
         suffix = self.output.suffix.lower()
         if self.resume and self.force:
             raise ConfigError("--resume: not allowed with --force, which renders everything anew")
@@ -115,6 +118,18 @@ class PlaySettings:
             raise ConfigError(f"--format: {self.output.name} says which format it is")
         if self.background == "transparent" and suffix == VIDEO:
             raise ConfigError("--background: a video has no transparency")
+
+
+def _frame_rate(value: Any) -> float:
+    from player.cameras.nerfstudio import LEAST_FPS, MOST_FPS
+
+    try:
+        fps = float(value)
+    except (TypeError, ValueError, OverflowError):
+        fps = math.nan
+    if not LEAST_FPS <= fps <= MOST_FPS:
+        raise ConfigError(f"--fps: expected {LEAST_FPS} to {MOST_FPS} frames a second, got {brief(value)}")
+    return fps
 
 
 MODES = {
@@ -247,7 +262,7 @@ def _add_files(group: argparse._ArgumentGroup) -> None:
     add("--frames", type=part, metavar="A:B", help="only these of the views, as a slice in Python")
     add(
         "--fps",
-        type=number("frames a second", "30", 0, 1000),
+        type=number("frames a second", "30"),
         metavar="N",
         help="frames a second of a video (the camera path's, else 30)",
     )

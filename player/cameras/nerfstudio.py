@@ -23,6 +23,8 @@ from player.errors import FormatError
 from player.files.json_files import as_float, brief, parse_json, read_json
 
 PLACEMENT = "dataparser_transforms.json"
+LEAST_FPS, MOST_FPS = 0.001, 1000
+"""Frames a second that a video can have."""
 
 
 def is_camera_path(document: Any) -> bool:
@@ -66,8 +68,10 @@ def path_frame_rate(document: dict[str, Any], path: Path) -> float | None:
     if document.get("fps") is None:
         return None
     fps = as_float(document["fps"])
-    if fps is None or not 0 < fps <= 1000:
-        raise FormatError(f"{path}: fps: expected 0 to 1000 frames a second, got {brief(document['fps'])}")
+    if fps is None or not LEAST_FPS <= fps <= MOST_FPS:
+        raise FormatError(
+            f"{path}: fps: expected {LEAST_FPS} to {MOST_FPS} frames a second, got {brief(document['fps'])}"
+        )
     return fps
 
 

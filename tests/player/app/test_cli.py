@@ -273,9 +273,10 @@ def test_check_looks_into_files_whose_checksums_hold(
         ),
         (["--orbit", "3", "--output", "o", "--fps", "3"], "--fps: expected a video"),
         (
-            ["--orbit", "3", "--output", "o.mp4", "--fps", "0"],
-            "a number over 0 up to 1000, such as 30, got '0'",
+            ["--orbit", "3", "--output", "o.mp4", "--fps", "0.0009"],
+            "--fps: expected 0.001 to 1000 frames a second, got 0.0009",
         ),
+        (["--orbit", "3", "--output", "o.mp4", "--fps", "inf"], "a number, such as 30, got 'inf'"),
         (["--orbit", "3", "--output", "o.mp4", "--background", "transparent"], "a video has no transparency"),
         (["--orbit", "3", "--output", "o", "--size", "0x0"], "from 1x1 on, such as 800x600, got '0x0'"),
         (["--view", "x", "--output", "o"], "expected a whole number, such as 3, got 'x'"),

@@ -106,9 +106,13 @@ def test_a_program_plays_as_the_command_does(
         ("a", {"resume": True, "force": True}, "--resume: not allowed with --force"),
         ("a.png", {"format": "webp"}, "--format: a.png says which format it is"),
         ("a.MP4", {"background": "transparent"}, "--background: a video has no transparency"),
+        *(
+            ("a.mp4", {"fps": fps}, "--fps: expected 0.001 to 1000 frames a second, got ")
+            for fps in (0, 0.0009, 1001, -30, math.nan, math.inf, None, "fast")
+        ),
     ],
 )
-def test_settings_that_contradict_each_other(output: str, settings: dict[str, Any], message: str) -> None:
+def test_settings_that_cannot_be(output: str, settings: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         PlaySettings(Path(output), **settings)
 

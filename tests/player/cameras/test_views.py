@@ -118,6 +118,13 @@ BAD_PATHS: list[tuple[Any, str]] = [
 ]
 
 
+@pytest.mark.parametrize("fps", [0, 0.0009, 1001, -30, "30"])
+def test_a_frame_rate_that_no_video_has(fps: Any, tmp_path: Path) -> None:
+    with pytest.raises(FormatError, match=f"fps: expected 0.001 to 1000 frames a second, got {fps}"):
+        frame_rate(write(tmp_path, path_document() | {"fps": fps}))
+    assert frame_rate(write(tmp_path, path_document() | {"fps": 0.001})) == 0.001
+
+
 @pytest.mark.parametrize(("document", "message"), BAD_PATHS)
 def test_broken_paths_name_file_and_frame(document: Any, message: str, tmp_path: Path) -> None:
     path = write(tmp_path, document)
