@@ -185,12 +185,10 @@ class Renderer:
             ConfigError: a picture over MAX_PIXELS, or a setting out of range.
         """
         k = self.asset.manifest.n_fetches if n_fetches is None else n_fetches
-        if isinstance(k, bool) or not isinstance(k, int | np.integer) or k < 0:
-            raise ConfigError(f"samples: expected 0 (all) or more, a whole number, got {brief(k)}")
-        k = int(k)  # numba would compile the march again for an integer of numpy
+        k = checked_samples(k)
         check_size(camera.width, camera.height)
-        background = _background(self.asset.manifest.background if background is None else background)
-        _check_choice("quality", quality, get_args(Quality))
+        background = checked_background(self.asset.manifest.background if background is None else background)
+        check_choice("quality", quality, get_args(Quality))
         reduced = self._reduced(quality)
         k = min((n for n in (k, reduced.n_fetches) if n), default=0)
         k = min(k, self._grid.most_samples)
@@ -335,14 +333,22 @@ def check_size(width: int, height: int) -> None:
         )
 
 
-def _check_choice(name: str, value: object, allowed: tuple[str, ...]) -> None:
+def checked_samples(value: object) -> int:
+    """Return a number of feature lookups as an integer of Python: numba would compile the march again for one
+    of numpy. Raises ConfigError."""
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 0:
+        raise ConfigError(f"samples: expected 0 (all) or more, a whole number, got {brief(value)}")
+    return int(value)
+
+
+def check_choice(name: str, value: object, allowed: tuple[str, ...]) -> None:
     """Raise ConfigError if the setting `name` is none of the words that are allowed."""
     if not isinstance(value, str) or value not in allowed:
         raise ConfigError(f"{name}: expected {', '.join(allowed[:-1])} or {allowed[-1]}, got {brief(value)}")
 
 
-def _background(value: object) -> Background:
-    """Return a background as a frame has it. Raises ConfigError."""
+def checked_background(value: object) -> Background:
+    """Return a background as a frame has it: "transparent" or three floats. Raises ConfigError."""
     if isinstance(value, str) and value == "transparent":
         return "transparent"
     try:
@@ -361,7 +367,7 @@ def choose_march(name: March) -> tuple[str, ModuleType]:
     Raises MissingExtraError: `name` is "numba", which is not installed or does not run here; ConfigError:
     there is no such march.
     """
-    _check_choice("march", name, get_args(March))
+    check_choice("march", name, get_args(March))
     if name != "numpy":
         from player import compiling, proof
 

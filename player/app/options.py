@@ -8,7 +8,7 @@ import math
 import sys
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, TypeVar, get_args
 
 from player.app.option_types import (
     asset_folder,
@@ -105,7 +105,16 @@ class PlaySettings:
     """Gigabytes that the asset may take on a worker of a cluster; half of its machine's if None."""
 
     def __post_init__(self) -> None:
+        from player.render import Quality, check_choice, checked_background, checked_samples
+
         object.__setattr__(self, "fps", _frame_rate(self.fps))
+        if self.samples is not None:
+            object.__setattr__(self, "samples", checked_samples(self.samples))
+        if self.background is not None:
+            object.__setattr__(self, "background", checked_background(self.background))
+        check_choice("quality", self.quality, get_args(Quality))
+        if self.format is not None:
+            check_choice("format", self.format, ("png", "webp"))
         suffix = self.output.suffix.lower()
         if self.resume and self.force:
             raise ConfigError("--resume: not allowed with --force, which renders everything anew")

@@ -13,7 +13,7 @@ from contextlib import ExitStack, contextmanager, redirect_stdout
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 
@@ -21,7 +21,15 @@ from player.asset.asset import Asset
 from player.cameras.camera import focus_point, orbit, world_up
 from player.cameras.views import asset_cameras
 from player.errors import ConfigError, MissingExtraError
-from player.render import Background, March, Quality, Renderer
+from player.render import (
+    Background,
+    March,
+    Quality,
+    Renderer,
+    check_choice,
+    checked_background,
+    checked_samples,
+)
 from player.terminal import command_line, printable
 from player.viewer.growing import Growing, tell_what_is_missing
 from player.viewer.pages import NO_PAGES, Pages
@@ -36,7 +44,8 @@ EVERY_ADDRESS = ("0.0.0.0", "::")
 
 @dataclass(frozen=True)
 class ServeSettings:
-    """Settings of `player.serve`. Raises ConfigError for a transparent background."""
+    """Settings of `player.serve`. Raises ConfigError for settings that are out of range, and for a
+    transparent background."""
 
     host: str = "127.0.0.1"
     """Address to serve at; as it is, this machine alone is let in."""
@@ -56,6 +65,12 @@ class ServeSettings:
     """Gigabytes that an asset may take when it is opened for its page; half of the machine's if None."""
 
     def __post_init__(self) -> None:
+        if self.samples is not None:
+            object.__setattr__(self, "samples", checked_samples(self.samples))
+        if self.quality is not None:
+            check_choice("quality", self.quality, get_args(Quality))
+        if self.background is not None:
+            object.__setattr__(self, "background", checked_background(self.background))
         if self.background == "transparent":
             raise ConfigError("--background: expected a colour for the viewer, got transparent")
 

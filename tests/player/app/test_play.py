@@ -106,6 +106,11 @@ def test_a_program_plays_as_the_command_does(
         ("a", {"resume": True, "force": True}, "--resume: not allowed with --force"),
         ("a.png", {"format": "webp"}, "--format: a.png says which format it is"),
         ("a.MP4", {"background": "transparent"}, "--background: a video has no transparency"),
+        ("a", {"samples": 2.5}, "samples: expected 0 .all. or more, a whole number, got 2.5"),
+        ("a", {"quality": "best"}, "quality: expected exact, high or fast, got best"),
+        ("a", {"format": "jpg"}, "format: expected png or webp, got jpg"),
+        ("a", {"background": np.ones(2)}, "background: expected three numbers in 0"),
+        ("a", {"background": "white"}, "background: expected three numbers in 0"),
         *(
             ("a.mp4", {"fps": fps}, "--fps: expected 0.001 to 1000 frames a second, got ")
             for fps in (0, 0.0009, 1001, -30, math.nan, math.inf, None, "fast")
@@ -115,6 +120,20 @@ def test_a_program_plays_as_the_command_does(
 def test_settings_that_cannot_be(output: str, settings: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         PlaySettings(Path(output), **settings)
+
+
+@pytest.mark.parametrize("name", ["frames", pytest.param("turn.mp4", marks=pytest.mark.extra)])
+def test_settings_with_numbers_of_any_kind_resume_a_run(
+    name: str, asset: Asset, shells_folder: Path, tmp_path: Path
+) -> None:
+    """Whole numbers and arrays are the settings that the command line has read from the same digits."""
+    output = tmp_path / name
+    options = ["--background", "white", "--samples", "3", "--march", "numpy", "--output", str(output)]
+    options += ["--fps", "7"] if name == "turn.mp4" else []
+    assert cli.main([*trained(shells_folder), *options]) == 0
+    for white, samples in (((1, 1, 1), np.int64(3)), (np.ones(3), 3), ([1, 1, np.float32(1)], np.uint8(3))):
+        settings = PlaySettings(output, None, None, 7, True, background=white, samples=samples, march="numpy")  # type: ignore[arg-type]
+        assert play(asset, asset_cameras(asset), settings).n_kept == 5
 
 
 def test_a_picture_that_takes_much_memory_is_told_of(asset: Asset) -> None:

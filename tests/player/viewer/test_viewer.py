@@ -171,6 +171,19 @@ def test_visitors_are_told_an_address_that_leads_to_this_machine(monkeypatch: py
     assert address_for_others("0.0.0.0", here) == here
 
 
+def test_settings_of_the_viewer_are_checked_when_they_are_made() -> None:
+    settings = ServeSettings(samples=np.int64(3), background=np.ones(3))  # type: ignore[arg-type]
+    assert settings == ServeSettings(samples=3, background=(1.0, 1.0, 1.0))
+    for wrong, message in (
+        ({"samples": -1}, "samples: expected 0"),
+        ({"quality": "best"}, "quality: expected exact, high or fast, got best"),
+        ({"background": "white"}, "background: expected three numbers in 0"),
+        ({"background": "transparent"}, "expected a colour for the viewer, got transparent"),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            ServeSettings(**wrong)
+
+
 def test_a_program_serves_as_the_command_does(asset: Asset, capfd: pytest.CaptureFixture[str]) -> None:
     """`serve` serves one asset or several while its block runs, and prints nothing."""
     for assets in (asset, [asset, asset]):
