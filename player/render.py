@@ -114,7 +114,7 @@ class Renderer:
 
     def __init__(self, asset: Asset, n_threads: int | None = None, march: March = "auto") -> None:
         """Raises MissingExtraError if `march` is "numba" and that is not installed or does not run here;
-        ConfigError if there is no such march, or `n_threads` is below 1."""
+        ConfigError if there is no such march, or `n_threads` is no whole number from 1 on."""
         self.n_threads = default_threads() if n_threads is None else bounded_threads(n_threads)
         self._grid = asset.grid  # built first: numba may still be importing (`import_ahead`)
         self.march, self._module = choose_march(march)

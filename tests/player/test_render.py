@@ -217,6 +217,11 @@ def test_too_large_and_other_settings(asset: Asset, camera: Camera, monkeypatch:
         render(asset, camera, n_fetches=-1)
     with pytest.raises(ConfigError, match="threads: expected at least 1, got 0"):
         Renderer(asset, 0)
+    for n_threads in (2.0, "2"):
+        with pytest.raises(ConfigError, match=f"threads: expected a whole number, got {n_threads}"):
+            Renderer(asset, n_threads)  # type: ignore[arg-type]
+    with Renderer(asset, np.int64(2)) as renderer:  # type: ignore[arg-type]
+        assert type(renderer.n_threads) is int
     monkeypatch.setattr("player.compiling.numba", None)
     with pytest.raises(MissingExtraError, match=r"pip install 'vfr-bake\[fast\]'"):
         Renderer(asset, 1, "numba")
