@@ -427,6 +427,8 @@ def test_photographs_without_cameras_have_them_estimated(
     monkeypatch.setattr("vfr_bake.data.poses.estimate_cameras", estimate)
     assert train_main([str(photos), str(tmp_path / "model.pt")]) == 1
     one_error(capsys, "found none")
+    assert train_main([str(photos), str(tmp_path / "model.pt"), "--scale", "x", "y", "1"]) == 1
+    one_error(capsys, "scale: x: expected one picture of that name, got none")
     assert calls == [photos]
 
 

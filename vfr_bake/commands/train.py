@@ -62,7 +62,7 @@ def train_command(options: Any) -> int:
     # The pictures of a ZIP or a video can be looked at only once they are unpacked.
     packed = not Path(options.data).is_dir()
     glance = _glance(options.data, config) if processes.first and not packed else None
-    data = processes.in_turn(lambda: _with_cameras(options.data))
+    data = processes.in_turn(lambda: _with_cameras(options.data, config.scale))
     if processes.first and packed:
         glance = _glance(data, config)
     if glance is not None:
@@ -187,10 +187,11 @@ def _say(data: str, text: str) -> None:
     print(f"vfr-train: {printable(f'{data}: {text}')}", file=sys.stderr)
 
 
-def _with_cameras(data: str) -> str:
+def _with_cameras(data: str, scale: tuple[str, str, float] | None = None) -> str:
     """Return the folder to load. Unpack a ZIP first, and estimate the cameras of photographs or a video that
-    have none. What stays as it is keeps its name: `./demo` is a folder, and `demo` the built-in scene."""
-    from vfr_bake.data import needs_cameras, unpacked
+    have none, after looking for the pictures that `scale` names. What stays as it is keeps its name: `./demo`
+    is a folder, and `demo` the built-in scene."""
+    from vfr_bake.data import check_scale, needs_cameras, unpacked
     from vfr_bake.data.poses import added_since, estimate_cameras
 
     if data == "demo":
@@ -208,6 +209,8 @@ def _with_cameras(data: str) -> str:
                 f"({named}): remove {folder / 'sparse'} to use them",
             )
         return data
+    if scale is not None and folder.is_dir():
+        check_scale(folder, scale)
     with Bars() as bars:
         report = estimate_cameras(Path(data), bars.count, partial(_say, data))
     print(f"vfr-train: {printable(report.summary())}", file=sys.stderr)

@@ -8,10 +8,13 @@ from pathlib import Path
 from typing import Any
 
 from player.cameras.colmap import colmap_folder
+from player.errors import DataError
 from player.progress import Progress
 from vfr_bake.config import SceneKind, TrainConfig
 from vfr_bake.data.demo import demo_capture
 from vfr_bake.data.files.archives import is_archive, unpack
+from vfr_bake.data.files.estimate_record import read_record
+from vfr_bake.data.files.listing import find_pictures
 from vfr_bake.data.files.source import check_source
 from vfr_bake.data.files.video import frames_folder
 from vfr_bake.data.folders import has_transforms, load_folder
@@ -19,11 +22,12 @@ from vfr_bake.data.poses import has_pictures, is_video
 from vfr_bake.data.scene import PosedImages, Scene, build_scene
 from vfr_bake.data.store.reading import PictureReader
 from vfr_bake.data.store.working import MAX_SIDE, WorkingSize
-from vfr_bake.data.world import scaled
+from vfr_bake.data.world import named, scaled
 
 __all__ = [
     "PosedImages",
     "Scene",
+    "check_scale",
     "load_scene",
     "load_scene_as",
     "needs_cameras",
@@ -56,6 +60,7 @@ def load_scene(
     the disk has no room for the pictures that the reader stores there.
     """
     reader = reader or PictureReader(WorkingSize(downscale=downscale))
+    why: dict[str, str] = {}
     if str(data) == "demo":
         capture = demo_capture(progress=progress)
         train, test = reader.size.of(capture.train), reader.size.of(capture.test)
@@ -66,8 +71,10 @@ def load_scene(
             check_source(frames_folder(folder), folder)
             folder = frames_folder(folder)
         capture = load_folder(folder, progress, reader)
+        if (model := colmap_folder(folder)) is not None:
+            why = read_record(model).why_without_camera()
     if scale is not None:
-        capture = scaled(capture, *scale)
+        capture = scaled(capture, *scale, why)
     scene = build_scene(capture, kind)
     if kind == "auto" and scene.masked and not capture.masked:
         reader.say(
@@ -119,6 +126,19 @@ def unpacked(data: str | Path, progress: Progress | None = None) -> Path:
     """
     path = Path(data)
     return unpack(path, progress or (lambda done, of: None)) if is_archive(path) else path
+
+
+def check_scale(folder: Path, scale: tuple[str, str, float]) -> None:
+    """Raise DataError unless the pictures that `scale` names are in a folder of pictures: what is mistyped is
+    found out before their cameras are estimated."""
+    place, pictures = find_pictures(folder)
+    names = [path.relative_to(place).as_posix() for path in pictures]
+    for name in scale[:2]:
+        if len(found := named(names, name)) != 1:
+            raise DataError(
+                f"{folder}: scale: {name}: expected one picture of that name, got {len(found) or 'none'}: "
+                f"the first is called {names[0]}"
+            )
 
 
 def needs_cameras(data: str | Path) -> bool:

@@ -7,6 +7,7 @@ ground, that surface is the largest level plane in the scene, and nothing lies b
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -119,13 +120,16 @@ def turn_to_z(up: np.ndarray) -> np.ndarray:
     )
 
 
-def scaled(capture: Capture, first: str, second: str, distance: float) -> Capture:
+def scaled(
+    capture: Capture, first: str, second: str, distance: float, why: Mapping[str, str] | None = None
+) -> Capture:
     """Return the capture in a world in which two of its cameras are `distance` units apart.
 
-    `first`, `second`: file names of the pictures that these cameras took. `distance`: more than 0. Raises
-    DataError: there is no such picture, or both are from one place.
+    `first`, `second`: file names of the pictures that these cameras took. `distance`: more than 0. `why`: the
+    reasons why further pictures have no camera, by their names. Raises DataError: there is no such picture,
+    it has no camera, or both are from one place.
     """
-    a, b = (_place(capture, name) for name in (first, second))
+    a, b = (_place(capture, name, why or {}) for name in (first, second))
     apart = float(np.linalg.norm(a - b))
     if apart <= 1e-9 * float(np.abs([a, b]).max()):
         raise DataError(
@@ -145,21 +149,36 @@ def scaled(capture: Capture, first: str, second: str, distance: float) -> Captur
     return replace(capture, train=moved(capture.train), test=moved(capture.test), points=points)
 
 
-def _place(capture: Capture, name: str) -> np.ndarray:
-    """Return the position [3] of the camera of the picture called `name`, which may lack its folder and its
-    suffix."""
+def _place(capture: Capture, name: str, why: Mapping[str, str]) -> np.ndarray:
+    """Return the position [3] of the camera of the picture called `name`."""
     cameras: list[Camera] = [*capture.train.cameras, *capture.test.cameras]
-    for form in (_whole, _last, _stem):
-        found = [camera for camera in cameras if form(camera.name) == form(name)]
-        if len(found) == 1:
-            return found[0].c2w[:3, 3]
-        if len(found) > 1:
-            break
-    got = f"{len(found)} of that name" if found else "none of that name"
+    found = named([camera.name for camera in cameras], name)
+    if len(found) == 1:
+        return cameras[found[0]].c2w[:3, 3]
+    left_out = named([*why], name)
+    if not found and len(left_out) == 1:
+        raise DataError(
+            f"{capture.name}: scale: {name}: expected a picture with a camera, got one without: "
+            f"{[*why.values()][left_out[0]]}: name another one"
+        )
     raise DataError(
-        f"{capture.name}: scale: {name}: expected one picture with a camera, got {got}: the first is called "
-        f"{cameras[0].name}"
+        f"{capture.name}: scale: {name}: expected one picture with a camera, got "
+        f"{len(found) or 'none'} of that name: the first is called {cameras[0].name}"
     )
+
+
+def named(names: Sequence[str], name: str) -> list[int]:
+    """Return the numbers of the pictures with these `names` that `name` means: it may lack the folder and the
+    suffix.
+
+    >>> named(["a/1.jpg", "b/1.jpg", "b/2.jpg"], "2"), named(["a/1.jpg", "b/1.jpg"], "1.jpg")
+    ([2], [0, 1])
+    """
+    for form in (_whole, _last, _stem):
+        found = [number for number, other in enumerate(names) if form(other) == form(name)]
+        if found:
+            return found
+    return []
 
 
 def _whole(name: str) -> str:

@@ -192,6 +192,14 @@ def test_pictures_that_were_removed_after_the_estimate_are_left_out(folder: Path
         load_folder(folder)
 
 
+def test_a_scale_by_a_picture_that_was_left_out(folder: Path) -> None:
+    write_record(folder / "sparse" / "0", EstimateRecord(True, {"IMG_9.png": "003.png"}))
+    with pytest.raises(
+        DataError, match=r"scale: IMG_9: expected .* got one without: shows what 003\.png does"
+    ):
+        load_scene(folder, scale=("000", "IMG_9", 2.0))
+
+
 def test_a_name_that_leaves_the_folder_is_refused(folder: Path) -> None:
     path = folder / "sparse/0/images.bin"
     path.write_bytes(path.read_bytes().replace(b"003.png", b"../3png"))

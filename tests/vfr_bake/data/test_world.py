@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from player.errors import DataError
+from vfr_bake.data import check_scale
 from vfr_bake.data.capture import Capture, PosedImages
 from vfr_bake.data.demo import demo_views
 from vfr_bake.data.world import find_up, scaled, turn_to_z
@@ -93,3 +96,25 @@ def test_a_picture_that_is_not_there(name: str) -> None:
         scaled(Capture("toy", train, test), train.cameras[0].name, name, 1.0)
     with pytest.raises(DataError, match="scale: expected two pictures from different places"):
         scaled(Capture("toy", train, PosedImages([], [])), *[train.cameras[0].name] * 2, 1.0)
+
+
+def test_a_picture_that_has_no_camera() -> None:
+    train, test = demo_views(16, 4, 2)
+    why = {"left/IMG_3.jpg": "shows what IMG_2.jpg does"}
+    with pytest.raises(
+        DataError,
+        match=r"IMG_3: expected a picture with a camera, got one without: shows what IMG_2\.jpg does:",
+    ):
+        scaled(Capture("toy", train, test), train.cameras[0].name, "IMG_3", 1.0, why)
+
+
+def test_names_that_are_mistyped_are_found_before_cameras_are_estimated(tmp_path: Path) -> None:
+    for name in ("a/1.jpg", "b/1.jpg", "b/2.jpg"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_bytes(b"")
+    check_scale(tmp_path, ("a/1.jpg", "2", 1.0))
+    for name, got in (("1.jpg", "2"), ("3.jpg", "none")):
+        with pytest.raises(
+            DataError, match=rf"{name}: expected one picture of that name, got {got}: the first is called a/1"
+        ):
+            check_scale(tmp_path, ("a/1.jpg", name, 1.0))

@@ -200,10 +200,7 @@ def _listed(data: str, progress: Progress) -> _Set:
             names += [path.relative_to(place).as_posix() for path in others]
             paths = paths + others
             found += [False] * len(others)
-            record = read_record(model)
-            why = record.unplaced | {
-                name: f"shows what {kept} does" for name, kept in record.repeated.items()
-            }
+            why = read_record(model).why_without_camera()
             new = f"added after the cameras were estimated: remove {folder / 'sparse'} to use it"
             why |= dict.fromkeys(added_since(folder), new)
         return _Set(kind, names, paths, found, cameras, why)

@@ -29,6 +29,15 @@ class EstimateRecord:
     n_bytes: dict[str, int] = field(default_factory=dict)
     """Size of each picture's file in bytes, by the picture's name; empty in a record of an older version."""
 
+    def why_without_camera(self) -> dict[str, str]:
+        """Return why pictures have no camera, by their names.
+
+        >>> EstimateRecord(True, {"b.jpg": "a.jpg"}, {"c.jpg": "blank"}).why_without_camera()
+        {'c.jpg': 'blank', 'b.jpg': 'shows what a.jpg does'}
+        """
+        shown = {name: f"shows what {kept} does" for name, kept in self.repeated.items()}
+        return {**self.unplaced, **shown}
+
 
 def write_record(model: Path, record: EstimateRecord) -> None:
     """Write the record into the folder of a COLMAP model."""
