@@ -133,6 +133,7 @@ class Renderer:
         self._head = Head.of(asset, self.march == "numba")
         self._model_from_world = np.linalg.inv(asset.world_from_model)
         self._pool, self._process = self._new_pool(), os.getpid()
+        self._closed = False
 
     def __enter__(self) -> Renderer:
         return self
@@ -141,7 +142,8 @@ class Renderer:
         self.close()
 
     def close(self) -> None:
-        """End the threads; tasks that have not begun are dropped."""
+        """End the threads; tasks that have not begun are dropped. Nothing can be rendered afterwards."""
+        self._closed = True
         self._threads().shutdown(wait=True, cancel_futures=True)
 
     def _new_pool(self) -> ThreadPoolExecutor:
@@ -182,8 +184,10 @@ class Renderer:
                 picture is the same.
 
         Raises:
-            ConfigError: a picture over MAX_PIXELS, or a setting out of range.
+            ConfigError: a picture over MAX_PIXELS, a setting out of range, or a renderer that is closed.
         """
+        if self._closed:
+            raise ConfigError("renderer: expected an open one, got one that was closed: make another")
         k = self.asset.manifest.n_fetches if n_fetches is None else n_fetches
         k = checked_samples(k)
         check_size(camera.width, camera.height)

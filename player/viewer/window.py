@@ -294,6 +294,8 @@ class Window:
                 self._show_moving()
                 self._sharpen(version)
             except VfrError as error:
+                if self._closed:
+                    return
                 self._state.value = printable(str(error))
             except Exception:
                 if self._closed:  # the renderer may be closed, too, which ends a picture midway: no bug

@@ -263,6 +263,14 @@ def test_settings_that_are_none_are_told(asset: Asset, camera: Camera) -> None:
         Renderer(asset, 1, "foo")  # type: ignore[arg-type]
 
 
+def test_a_renderer_that_is_closed_says_so(asset: Asset, camera: Camera) -> None:
+    with Renderer(asset, 1, "numpy") as renderer:
+        frame = renderer.render(camera)
+    with pytest.raises(ConfigError, match="renderer: expected an open one, got one that was closed"):
+        renderer.render(camera)
+    assert frame.normals.shape == (40, 48, 3), "normals need no threads"
+
+
 def test_a_frame_is_pickled_with_the_layers_that_it_has(asset: Asset, camera: Camera) -> None:
     with Renderer(asset, 1) as renderer:
         whole, other = (renderer.render(camera, layers=layers) for layers in (True, False))

@@ -241,6 +241,20 @@ def test_normals_are_rendered_as_other_layers_are(asset: Asset, monkeypatch: pyt
     assert all(name.startswith("vfr-play") for name in names) and sent == ["screenshot.png"]
 
 
+def test_a_closed_window_says_nothing_of_its_renderer(asset: Asset) -> None:
+    camera = read_cameras(asset.path("cameras.json"))[0]
+    with Renderer(asset, 1, "numpy") as renderer:
+        window: Any = window_of(renderer, camera, "colour", [])
+
+    def closing() -> Camera:
+        window._closed = True
+        return camera
+
+    window._camera = closing
+    window._run()
+    assert window._state.value == ""
+
+
 @pytest.mark.parametrize("closed", [False, True])
 def test_a_picture_that_ends_with_its_window_is_no_bug(
     closed: bool, asset: Asset, monkeypatch: pytest.MonkeyPatch
@@ -250,6 +264,7 @@ def test_a_picture_that_ends_with_its_window_is_no_bug(
     camera, reported, sent = read_cameras(asset.path("cameras.json"))[0], [], []
     with Renderer(asset, 1, "numpy") as renderer:
         window = window_of(renderer, camera, "colour", sent)
+    monkeypatch.setattr(renderer, "_closed", False)  # as if it had been closed in the middle
 
     def interrupted() -> Camera:
         window._closed = closed
