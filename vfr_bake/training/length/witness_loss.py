@@ -25,7 +25,8 @@ from vfr_bake.training.scores.metrics import over_background
 PATCH_WEIGHT = 1 / 2
 """Weight of the patches if there are whole views too."""
 BLOCKS_OF_A_VIEW = 16
-"""Number of runs of rows into which the pixels of a single whole view are split, for the jackknife."""
+"""Number of runs of rows into which the witnesses of a view are split for the jackknife, if it is the only
+one with patches, or the only whole one."""
 
 
 class Loss(NamedTuple):
@@ -68,14 +69,15 @@ class WitnessLoss:
         self.is_whole = is_whole = np.isin(views, witnesses.whole)
         """[n_witnesses] bool: true for witnesses of whole views."""
         n_whole = len(np.unique(views[is_whole]))  # a view that is masked as a whole has no witness
-        if n_whole == 1:
-            run = np.arange(int(is_whole.sum())) * BLOCKS_OF_A_VIEW // max(int(is_whole.sum()), 1)
-            views[is_whole] = len(witnesses.counts) + run
+        for number, kind in enumerate((~is_whole, is_whole)):
+            if len(np.unique(views[kind])) == 1:
+                run = np.arange(int(kind.sum())) * BLOCKS_OF_A_VIEW // int(kind.sum())
+                views[kind] = len(witnesses.counts) + number * BLOCKS_OF_A_VIEW + run
         _, self._block = np.unique(views, return_inverse=True)
         self._n_blocks = int(self._block.max()) + 1
         self._kinds = [np.unique(self._block[kind]) for kind in (~is_whole, is_whole) if kind.any()]
-        """Numbers of the blocks of each kind of witness that there is: of the patches, one block for each
-        view, and of the whole views."""
+        """Numbers of the blocks of each kind of witness that there is: of the patches and of the whole views,
+        one block for each view, or the parts of the only one."""
         self._weights = (PATCH_WEIGHT, 1 - PATCH_WEIGHT) if len(self._kinds) == 2 else (1.0,)
         self._by_view = [n_whole > 1 and blocks is self._kinds[-1] for blocks in self._kinds]
         """For each kind of witness, whether its blocks are whole views, so that the loss is the mean of the
@@ -90,7 +92,7 @@ class WitnessLoss:
     def loss(self, before: np.ndarray, after: np.ndarray) -> Loss:
         """Return the loss of the errors `after` [n_witnesses], compared with the errors `before`.
 
-        The spread is found by a jackknife: every view (or every part of a single whole view) is left out
+        The spread is found by a jackknife: every view (or every part of the only view of a kind) is left out
         once. Whole views and not pixels are left out, because errors within a view are correlated.
         """
         db, variance = 0.0, 0.0

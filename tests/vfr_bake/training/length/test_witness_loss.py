@@ -21,19 +21,19 @@ def some_witnesses(counts: list[int], whole: list[int], seed: int = 0) -> Witnes
 
 
 def written_out(witnesses: Witnesses, before: np.ndarray, after: np.ndarray) -> tuple[float, float]:
-    """Return (loss, standard error) by loops over blocks: views, and the parts of a single whole view."""
+    """Return (loss, standard error) by loops over blocks: views, and the parts of the only view of a kind."""
     blocks: dict[tuple, list[int]] = {}
     views = witnesses.views()
     n_whole = len({view for view in views if view in witnesses.whole})
+    n_with_patches = len({*views}) - n_whole
     for i, view in enumerate(views):
-        if view not in witnesses.whole:
-            blocks.setdefault(("patches", view), []).append(i)
-        elif n_whole > 1:
-            blocks.setdefault(("whole", view), []).append(i)
+        kind = "whole" if view in witnesses.whole else "patches"
+        if (n_whole if kind == "whole" else n_with_patches) > 1:
+            blocks.setdefault((kind, view), []).append(i)
         else:
             place = i - int(np.flatnonzero(views == view)[0])
             part = place * BLOCKS_OF_A_VIEW // int((views == view).sum())
-            blocks.setdefault(("whole", part), []).append(i)
+            blocks.setdefault((kind, part), []).append(i)
 
     def lost(rows: list[int]) -> float:
         first, second = (math.fsum(e[i] for i in rows) / len(rows) for e in (before, after))
@@ -71,6 +71,7 @@ def written_out(witnesses: Witnesses, before: np.ndarray, after: np.ndarray) -> 
         ([7, 0, 6, 0, 9], [1, 3]),
         ([5, 6, 7], []),
         ([4], []),
+        ([40, 300], [1]),
         ([0, 3, 0], [1]),
         ([9, 20, 9], [1]),
     ],
@@ -133,6 +134,13 @@ def test_the_spread_is_as_large_as_the_losses_of_other_witnesses_differ() -> Non
         spreads.append(found.spread)
     # A standard deviation of 1000 draws is known to 2 %; a jackknife of four views adds some error.
     assert np.mean(spreads) == pytest.approx(np.std(losses), rel=0.12)
+
+
+def test_a_single_view_has_a_spread() -> None:
+    measured = WitnessLoss(some_witnesses([48], []), WHITE)
+    before, after = np.random.default_rng(5).exponential(0.01, (2, 48))
+    found = measured.loss(before, after)
+    assert found.most > found.db + 0.1
 
 
 def test_a_loss_in_words() -> None:
