@@ -70,10 +70,11 @@ files."""
 LEAST_REFINED = 0.4
 """Share of a bake's minutes that refinement may take in any case, however long everything before it took: a
 longer bake is better than a small head that is hardly trained."""
-VIEWS_TIMED = 4
-"""Views that are rendered to time the teacher, with as many rays each as in the bake. The timed rays differ
-from those of the run before, which compiles the code: the memory that those have read is in the cache, where
-rays are several times as fast as the millions of a bake."""
+VIEWS_TIMED, MOST_TIMED = 4, 25_000
+"""Views that are rendered to time the teacher, with as many rays each as in the bake, but at most MOST_TIMED:
+twice as many as in the bakes by which the costs below were measured, and few enough to take only seconds if
+there are few views. The timed rays differ from those of the run before, which compiles the code: the memory
+that those have read is in the cache, where rays are several times as fast as the millions of a bake."""
 STEP_COST, HEAD_COST = {False: 4.8, True: 0.7}, {False: 1.3, True: 0.6}
 """Time of a training ray in a step of refinement, and in a step that trains the head alone, by whether the
 scene is unbounded. The unit is the time that the teacher takes for a ray, which is several times as long in
@@ -238,7 +239,7 @@ def expected_seconds(model: Model, config: BakeConfig, plan: Plan) -> float:
     choice, unbounded = config.choice(model.field.config.unbounded), model.field.config.unbounded
     every = model.model_cameras()
     views = every[:: -(-len(every) // VIEWS_TIMED)]
-    a_view = max(plan.n_rays(plan.n_cells) // ((1 + BETWEEN) * len(every)), 1)
+    a_view = min(max(plan.n_rays(plan.n_cells) // ((1 + BETWEEN) * len(every)), 1), MOST_TIMED)
     n_rays = sum(min(a_view, camera.width * camera.height) for camera in views)
     render_teacher(model, views, a_view * len(views), 0, lambda done, of: None)  # compiles the code
     begin = time.perf_counter()

@@ -32,6 +32,7 @@ from vfr_bake.baking.plan import (
     FEW_DRAWN,
     FEWEST_RAYS,
     HEAD_COST,
+    MOST_TIMED,
     N_RAYS,
     OWN_HEAD,
     OWN_REST_COST,
@@ -301,6 +302,22 @@ def test_what_is_chosen_of_many_vertices_is_expected_to_take_longer(
     # a small head is also trained before refinement
     steps = OWN_HEAD * (step + alone) - (step + (1 + HEAD_SHARE) * alone)
     assert own - small == pytest.approx(OWN_REST_COST[False] + steps, rel=1e-6)
+
+
+def test_few_views_are_timed_with_few_rays(model: Model, monkeypatch: pytest.MonkeyPatch) -> None:
+    n_asked = []
+
+    def answer(model: Model, views: list[Camera], n_rays: int, *_: object) -> SimpleNamespace:
+        n_asked.append(n_rays // len(views))
+        return SimpleNamespace(opacity=np.ones(1))
+
+    monkeypatch.setattr("vfr_bake.baking.plan.render_teacher", answer)
+    plan = replace(make_plan(model, BakeConfig(**SMALL)), room=1e12, n_cells=1e7, most_rays=N_RAYS)
+    for n_views in (2, len(model.cameras)):
+        few = replace(model, cameras=model.cameras[:n_views], witnesses=None, training_pixels=None)
+        expected_seconds(few, BakeConfig(**SMALL), plan)
+    assert n_asked[:2] == [MOST_TIMED] * 2 and N_RAYS // 10 > MOST_TIMED
+    assert n_asked[2:] == [min(N_RAYS // (5 * len(model.cameras)), MOST_TIMED)] * 2
 
 
 def test_the_first_bake_is_expected_to_compile(model: Model, monkeypatch: pytest.MonkeyPatch) -> None:
