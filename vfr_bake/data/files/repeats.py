@@ -21,6 +21,9 @@ QUANTILE = 0.9
 MIN_MATCHES = 50
 MIN_SHARE = 0.3
 """Smallest share of the features of either picture that must match the other's."""
+SAME_SHAPE = 0.01
+"""Largest relative difference of the aspect ratios of two pictures of one shape: sizes of pictures that were
+made smaller are rounded."""
 SAME = 1.5
 """Mean difference of two thumbnails, in grey levels of 255, below which pictures look alike. The noise of a
 camera on a tripod stays below it."""
@@ -36,7 +39,7 @@ def repeats(
     same and is kept.
 
     Each picture is compared with the last one that was different, and with all whose thumbnails look alike.
-    Of those that show the same, the sharpest is kept.
+    Of those that show the same, the sharpest of the largest is kept.
 
     `features`: of each picture, in order. `sizes`: (width, height). `thumbnails`: [n, n_pixels] grey levels.
     `sharpness`: larger for sharper.
@@ -52,24 +55,27 @@ def repeats(
         candidates = {len(groups) - 1, *np.flatnonzero(alike).tolist()} - {-1}
         for place in sorted(candidates, reverse=True):
             leader = leaders[place]
-            if sizes[leader] == sizes[number] and show_same(
-                features[leader], features[number], sizes[number]
-            ):
+            if show_same(features[leader], features[number], sizes[leader], sizes[number]):
                 groups[place].append(number)
                 break
         else:
             groups.append([number])
     repeated = {}
     for group in groups:
-        kept = max(group, key=lambda number: sharpness[number])
+        kept = max(group, key=lambda number: (sizes[number], sharpness[number]))
         repeated |= {number: kept for number in group if number != kept}
     return dict(sorted(repeated.items()))
 
 
-def show_same(a: Features, b: Features, size: tuple[int, int]) -> bool:
-    """Return whether two pictures of one size (width, height) show the same from the same place."""
+def show_same(a: Features, b: Features, size_a: tuple[int, int], size_b: tuple[int, int]) -> bool:
+    """Return whether two pictures of one shape, of sizes (width, height), show the same from the same place.
+    One may be a copy of the other that was made smaller."""
+    (width_a, height_a), (width_b, height_b) = size_a, size_b
+    if abs(width_a * height_b - width_b * height_a) > SAME_SHAPE * width_b * height_a:
+        return False
     pairs = match(a.descriptors, b.descriptors)
     if len(pairs) < max(MIN_MATCHES, MIN_SHARE * max(len(a.points), len(b.points))):
         return False
-    shifts = np.linalg.norm(a.points[pairs[:, 0]] - b.points[pairs[:, 1]], axis=1)
-    return bool(np.quantile(shifts, QUANTILE) < MAX_SHIFT * max(size))
+    places_a, places_b = a.points[pairs[:, 0]] / max(size_a), b.points[pairs[:, 1]] / max(size_b)
+    shifts = np.linalg.norm(places_a - places_b, axis=1)
+    return bool(np.quantile(shifts, QUANTILE) < MAX_SHIFT)

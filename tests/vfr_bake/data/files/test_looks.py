@@ -16,6 +16,7 @@ from vfr_bake.data import threads
 from vfr_bake.data.features import find_features, match
 from vfr_bake.data.files.looks import look_at
 from vfr_bake.data.files.pictures import decoding_bytes, read_picture
+from vfr_bake.data.files.repeats import repeats
 from vfr_bake.data.kept_matches import KeptMatches
 
 
@@ -129,3 +130,16 @@ def test_a_picture_in_srgb_is_read_bit_for_bit(tmp_path: Path) -> None:
     Image.fromarray(rgba).save(tmp_path / "wide.png", icc_profile=profile_like(DISPLAY_P3))
     wide = read_picture(tmp_path / "wide.png")
     assert np.array_equal(wide[..., 3:], alpha) and not np.array_equal(wide[..., :3], colours)
+
+
+def test_a_copy_that_was_made_smaller_shows_the_same(tmp_path: Path) -> None:
+    """The larger one is kept, however sharp the other is. A part of a picture is no copy of it."""
+    whole = Image.fromarray(blots(640, 480, 16))
+    pictures = [whole.resize((427, 320), Image.Resampling.LANCZOS), whole, whole.crop((80, 60, 560, 420))]
+    for number, picture in enumerate(pictures):
+        picture.save(tmp_path / f"{number}.png")
+    paths = [(tmp_path / f"{number}.png", None) for number in range(3)]
+    looks = look_at(paths, KeptMatches(tmp_path / "kept"), None)
+    sizes = [(look.sensor.width, look.sensor.height) for look in looks]
+    thumbnails = np.stack([look.thumbnail for look in looks])
+    assert repeats([look.features for look in looks], sizes, thumbnails, [3.0, 1.0, 2.0]) == {0: 1}
