@@ -144,6 +144,9 @@ class CaptureEffects:
         if self.moving_on:
             self._contradicting = moving.contradicting(self._mean_errors(), self._contradicting)
             self._left_out = moving.widened(self._contradicting)
+            if self.share_left_out > moving.MOST_LEFT_OUT:
+                self.moving_on = False
+                self._contradicting = self._left_out = torch.zeros_like(self._contradicting)
 
     def _check(self) -> None:
         if not self.exposure_on:

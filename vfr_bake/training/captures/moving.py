@@ -38,6 +38,9 @@ IS_OVER = 0.075
 SHARES = (1e-3, 0.3)
 """Smallest and largest share of cells that stand out if something moves. With a smaller share, leaving cells
 out is not worth it; with a larger one, it is the field that fails, and nothing moves."""
+MOST_LEFT_OUT = 0.5
+"""Largest share of the pictures' area that is left out, with the neighbours of the cells that stand out. If
+these cells are scattered, their neighbours are nearly everything, and too little is left to learn from."""
 TWO_KINDS = 0.4
 """Smallest share of cells that stand out, among those above IS_OVER, if something moves: then few cells only
 nearly stand out. A field that is not trained yet has few cells that stand out, and many that nearly do."""

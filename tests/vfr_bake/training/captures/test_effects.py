@@ -13,6 +13,7 @@ from vfr_bake.data.demo import demo_views
 from vfr_bake.training.captures import effects, exposure
 from vfr_bake.training.checkpoint import load_checkpoint, save_checkpoint
 from vfr_bake.training.model_file import load_model, save_model, trained_model
+from vfr_bake.training.processes import Processes
 from vfr_bake.training.scores.evaluation import render_views
 from vfr_bake.training.trainer import Trainer
 
@@ -55,6 +56,40 @@ def test_changing_exposure_is_found_learned_and_kept(tmp_path: Path) -> None:
     load_checkpoint(tmp_path / "c", resumed)
     assert torch.equal(resumed.effects.correction.gains, trainer.effects.correction.gains)
     assert resumed.effects.figures() == trainer.effects.figures()
+
+
+def seen_of(cells: torch.Tensor) -> effects.Seen:
+    """Return what a step sees that draws a pixel of each cell, if those of `cells` contradict the others."""
+    pictures, rows, columns = torch.meshgrid(*(torch.arange(n) for n in cells.shape), indexing="ij")
+    n, side = cells.numel(), cells.shape[1]
+    places = (torch.stack([columns, rows], dim=-1).view(n, 2) + 0.5) / side
+    errors = (0.01 + 0.4 * cells.view(n, 1)).expand(n, 3)
+    some, all_of = torch.full((n, 3), 0.5), torch.ones(n)
+    return effects.Seen(pictures.reshape(n), places, some, all_of, some, all_of > 0, errors)
+
+
+def test_what_moves_is_left_out_unless_that_is_most_of_the_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(effects, "CHECKS", (16, 32))
+    found = effects.CaptureEffects(8, Processes(0, 1), torch.device("cpu"))
+    scattered, person, most = torch.zeros(3, 8, 16, 16, dtype=torch.bool)
+    scattered[:, ::2, ::3] = scattered[:, 1::4, 1::3] = True  # a quarter of the cells
+    person[:, 4:12, 4:8] = True
+    most[:, :12] = True
+
+    def observe(cells: torch.Tensor) -> None:
+        for _ in range(16):
+            found.observe(seen_of(cells), cells.numel())
+
+    observe(scattered)
+    assert 0.25 < (found.moving_share or 0) < 0.3 and not found.moving_on and found.share_left_out == 0
+    found = effects.CaptureEffects(8, Processes(0, 1), torch.device("cpu"))
+    observe(person)
+    assert found.moving_on and found.share_left_out == 60 / 256
+    for _ in range(8):
+        observe(most)
+    assert not found.moving_on and found.share_left_out == 0
+    some = seen_of(most)
+    assert found.learned(some.pictures, some.places) is None
 
 
 def test_a_step_that_is_not_finite_leaves_them_alone(monkeypatch: pytest.MonkeyPatch) -> None:
