@@ -263,8 +263,7 @@ class Trainer:
 
     @property
     def _is_unclear(self) -> bool:
-        """True while capture effects are on: they leave errors at the witnesses that training cannot
-        reduce."""
+        """True while capture effects are on: training cannot reduce errors that they leave at witnesses."""
         return self.effects.exposure_on or self.effects.moving_on
 
     def _step(self, step: int, progress: float) -> tuple[float, int, int]:
@@ -462,15 +461,16 @@ class Trainer:
 
     def restore(self, state: dict[str, Any]) -> None:
         """Continue from what `state` returned, as if there had been no interruption."""
-        self.next_step, self.seconds = state["step"], state["seconds"]
-        self.n_bad_steps = state["n_bad_steps"]
+        self.next_step, self.seconds, self.n_bad_steps = state["step"], state["seconds"], state["n_bad_steps"]
         self._generator.set_state(state["generator"])
         self._field.load_state_dict(state["field"])
         self.pilot.load_state_dict(state["pilot"])
         self._adam.restore(state["adam"])
         self._grid_adam.restore(state["grid_adam"])
         self._guide.restore(state["guide"])
-        self._keep_apart(restore_witnesses(state["witnesses"], self._views.cameras, "witnesses"))
+        witnesses = restore_witnesses(state["witnesses"], self._views.cameras, "witnesses")
+        del self._pixels  # otherwise, memory would hold the pictures twice
+        self._keep_apart(witnesses)
         self._pixels.restore(state["pixels"])
         self.effects.restore(state["effects"])
         self.duration.restore(state["duration"])

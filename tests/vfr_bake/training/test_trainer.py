@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import itertools
 import math
+import weakref
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -25,7 +27,7 @@ from vfr_bake.training.checkpoint import load_checkpoint, save_checkpoint
 from vfr_bake.training.gradients import CERTAIN, chosen_rays, scale_near_gradients
 from vfr_bake.training.model_file import trained_model
 from vfr_bake.training.optimiser import DENSITY_DECAY
-from vfr_bake.training.rays import RayBatch
+from vfr_bake.training.rays import PixelSampler, RayBatch
 from vfr_bake.training.scores.evaluation import render_views
 from vfr_bake.training.trainer import Trainer
 
@@ -296,6 +298,19 @@ def test_pixels_for_a_bake_are_those_that_training_learns_from(scene: Scene) -> 
     opaque = every.rgba[:, 3] == 255
     assert 0 < len(masked.pixels) < len(every.pixels) and (masked.rgba[:, 3] == 255).all()
     assert len(masked.pixels) >= opaque.sum(), "witnesses that are masked are none"
+
+
+def test_a_restored_training_holds_its_pictures_once(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    trainer = Trainer(scene, config(steps=3))
+    before = weakref.ref(trainer._pixels)
+
+    def made(*given: Any) -> PixelSampler:
+        assert before() is None
+        return PixelSampler(*given)
+
+    monkeypatch.setattr("vfr_bake.training.trainer.PixelSampler", made)
+    trainer.restore(trainer.state())
+    assert trainer._pixels.position
 
 
 def test_a_checkpoint_of_another_run_is_refused(scene: Scene, tmp_path: Path) -> None:
