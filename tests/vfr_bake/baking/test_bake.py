@@ -473,6 +473,7 @@ def test_the_mesh_lies_on_the_true_surface_in_world_units(model: Model, default_
 
 def test_a_folder_that_exists_is_kept(model: Model, tmp_path: Path) -> None:
     (tmp_path / "asset").mkdir()
+    (tmp_path / "asset" / "photo.jpg").touch()
     with pytest.raises(OutputError, match="--force"):
         bake(model, tmp_path / "asset", BakeConfig(), quiet)
 
