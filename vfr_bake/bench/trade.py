@@ -345,7 +345,12 @@ def _read_views(config: BenchConfig, assets: list[Asset], progress: Report) -> t
     """Return the views to compare, in an order of which every beginning is spread evenly, and lines to
     print."""
     train = assets[0].manifest.provenance.get("train", {})
-    scene = load_scene_as(train, config.data, lambda done, of: progress("reading pictures", done, of))
+    scene = load_scene_as(
+        train,
+        assets[0].manifest.contracted,
+        config.data,
+        lambda done, of: progress("reading pictures", done, of),
+    )
     exposure = any(_exposure_learned(asset.manifest.provenance) for asset in assets)
     learned = [Learned(str(asset.folder), asset_cameras(asset), asset.world_from_model) for asset in assets]
     if config.model is not None:

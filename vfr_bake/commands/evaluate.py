@@ -32,7 +32,7 @@ def eval_command(options: Any) -> int:
     lpips = None if options.lpips is None else Lpips(options.lpips)
     model = load_model(options.model, options.max_memory)
     with Bar("reading pictures") as bar:
-        scene = load_scene_as(model.train, options.data, bar.count)
+        scene = load_scene_as(model.train, model.field.config.unbounded, options.data, bar.count)
     learned = Learned(str(options.model), model.cameras, model.world_from_model)
     views, lines = scored_views(scene, options.data, model.exposure is not None, [learned])
     for line in lines:

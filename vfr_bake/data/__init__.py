@@ -106,13 +106,14 @@ def reader_as(settings: dict[str, Any]) -> PictureReader:
     return PictureReader(size, on_disk=True)
 
 
-def load_scene_as(settings: dict[str, Any], data: str | Path, progress: Progress | None = None) -> Scene:
+def load_scene_as(
+    settings: dict[str, Any], unbounded: bool, data: str | Path, progress: Progress | None = None
+) -> Scene:
     """Load the pictures that `data` names in the way in which a training with these `settings` loaded them:
     reduced to the same size, in the same unit, and with transparent pixels masked if the scene was trained as
-    an unbounded one, and not if it was trained as an object. Models and assets record these settings. The
+    an `unbounded` one, and not if it was trained as an object. Models and assets record these settings. The
     other arguments and the errors are those of `load_scene`."""
-    recorded = settings.get("kind")
-    kind: SceneKind = recorded if recorded in ("object", "unbounded") else "auto"
+    kind: SceneKind = "unbounded" if unbounded else "object"
     reader = reader_as(settings)
     return load_scene(data, progress, kind=kind, scale=settings.get("scale"), reader=reader)
 
@@ -134,10 +135,10 @@ def check_scale(folder: Path, scale: tuple[str, str, float]) -> None:
     place, pictures = find_pictures(folder)
     names = [path.relative_to(place).as_posix() for path in pictures]
     for name in scale[:2]:
-        if len(found := named(names, name)) != 1:
+        if not named(names, name):
             raise DataError(
-                f"{folder}: scale: {name}: expected one picture of that name, got {len(found) or 'none'}: "
-                f"the first is called {names[0]}"
+                f"{folder}: scale: {name}: expected one picture of that name, got none: the first is called "
+                f"{names[0]}"
             )
 
 

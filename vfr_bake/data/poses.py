@@ -186,7 +186,7 @@ def estimate_cameras(
     masked = [(path, mask_of(photos, name)) for path, name in zip(pictures, names, strict=True)]
     n_bytes = {name: path.stat().st_size for path, name in zip(pictures, names, strict=True)}
     masks = [mask for _, mask in masked if mask is not None]
-    if say is not None and (strays := stray_masks(photos, masks)):
+    if say is not None and (strays := stray_masks(photos, {*masks})):
         say(strays)
     known = KeptMatches.of(photos, cache_root(), say)
     looks = look_at(masked, known, lambda done, of: progress("features", done, of))

@@ -29,6 +29,8 @@ N_LOOKED_AT = 200
 CAMERA_QUANTILE = 0.9
 """Share of an unbounded scene's cameras that lie in the unit ball: one that strayed must not shrink the
 rest."""
+STRAYED = 3.0
+"""One of a few cameras has strayed if it is this many times as far from the centre as any other."""
 NEAR_CAMERA = 0.05
 """Distance from a camera, in model units, at which matter begins if no points are known. Things nearer than a
 twentieth of the way to the subject are out of focus in a photograph."""
@@ -85,9 +87,9 @@ def build_scene(capture: Capture, kind: SceneKind = "auto") -> Scene:
             f"{capture.name}: training views: expected something to be seen, got pictures that are "
             "transparent everywhere: save them with their colours, or without transparency"
         )
-    plain = None if has_alpha else _plain_border(some)
     # An object is transparent around it in all its pictures; a few holes say nothing of the others.
     mostly_opaque = 2 * n_transparent < n_views
+    plain = _plain_border(some) if mostly_opaque else None
     unbounded = kind == "unbounded" or (kind == "auto" and mostly_opaque and plain is None)
     if unbounded:
         centre, half = _camera_ball(train.cameras)
@@ -119,7 +121,7 @@ def build_scene(capture: Capture, kind: SceneKind = "auto") -> Scene:
         unbounded,
         near,
         masked,
-        background=WHITE if unbounded or plain is None else plain,
+        background=WHITE if unbounded or has_alpha or plain is None else plain,
     )
 
 
@@ -177,7 +179,8 @@ def _camera_ball(cameras: list[Camera]) -> tuple[np.ndarray, float]:
     radius = float(np.quantile(distances, CAMERA_QUANTILE))
     # Of few cameras, the quantile lies between the last two, so that one that strayed would count. But where
     # all others are in one place, it did not stray.
-    if CAMERA_QUANTILE * (n_views - 1) > n_views - 2 > 0 and distances[-2] > 1e-3 * radius:
+    strayed = distances[-1] > STRAYED * distances[-2] > 1e-3 * radius if n_views > 2 else False
+    if strayed and CAMERA_QUANTILE * (n_views - 1) > n_views - 2:
         radius = float(distances[-2])
     return centre, radius
 

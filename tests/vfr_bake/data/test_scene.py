@@ -114,6 +114,9 @@ def test_a_few_transparent_pixels_do_not_make_an_object():
         scene = build_scene(capture)
         assert scene.unbounded == scene.masked == unbounded != scene.has_alpha
         assert build_scene(capture, "object").has_alpha
+    over_white = opaque(train, [255, 255, 255])
+    over_white.images[0][3, 4, 3] = 0
+    assert not build_scene(Capture("plain", over_white, test)).unbounded, "its border shows that it is one"
 
 
 def test_pictures_that_are_transparent_everywhere_are_refused():
@@ -148,6 +151,15 @@ def test_one_camera_that_strayed_does_not_shrink_the_rest(n_views: int):
     strayed = PosedImages([replace(train.cameras[0], c2w=pose), *train.cameras[1:]], train.images)
     found = build_scene(Capture("a", strayed, test), "unbounded").world_from_model[0, 0]
     assert 0.8 * unit < found < 1.25 * unit
+
+
+def test_a_camera_that_is_twice_as_far_away_did_not_stray():
+    train, test = demo_views(8, 3, 1)
+    unit = build_scene(Capture("a", train, test), "unbounded").world_from_model[0, 0]
+    pose = train.cameras[0].c2w.copy()
+    pose[:3, 3] += unit * pose[:3, 2]
+    views = PosedImages([replace(train.cameras[0], c2w=pose), *train.cameras[1:]], train.images)
+    assert build_scene(Capture("a", views, test), "unbounded").world_from_model[0, 0] > 1.5 * unit
 
 
 def test_three_cameras_at_the_centre_and_one_outside_have_a_ball():

@@ -113,8 +113,8 @@ def test_names_that_are_mistyped_are_found_before_cameras_are_estimated(tmp_path
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_bytes(b"")
     check_scale(tmp_path, ("a/1.jpg", "2", 1.0))
-    for name, got in (("1.jpg", "2"), ("3.jpg", "none")):
-        with pytest.raises(
-            DataError, match=rf"{name}: expected one picture of that name, got {got}: the first is called a/1"
-        ):
-            check_scale(tmp_path, ("a/1.jpg", name, 1.0))
+    check_scale(tmp_path, ("a/1.jpg", "1.jpg", 1.0))  # of two, one may be a copy that is left out
+    with pytest.raises(
+        DataError, match=r"3.jpg: expected one picture of that name, got none: the first is called a/1"
+    ):
+        check_scale(tmp_path, ("a/1.jpg", "3.jpg", 1.0))

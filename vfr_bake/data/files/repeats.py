@@ -62,7 +62,9 @@ def repeats(
             groups.append([number])
     repeated = {}
     for group in groups:
-        kept = max(group, key=lambda number: (sizes[number], sharpness[number]))
+        # Sizes that are the same but for rounding must not decide.
+        least = (1 - SAME_SHAPE) * max(sizes[number][0] for number in group)
+        kept = max((n for n in group if sizes[n][0] >= least), key=lambda number: sharpness[number])
         repeated |= {number: kept for number in group if number != kept}
     return dict(sorted(repeated.items()))
 

@@ -85,8 +85,8 @@ def extract_frames(video: Path, progress: Progress, say: Callable[[str], object]
             note_source(new, video)
         if say is not None and n_read < MIN_READ * n_frames:
             say(
-                f"{n_read} of about {n_frames} frames of {video.name} could be read: the file may be "
-                f"damaged: copy it again, and remove {folder}"
+                f"{n_read} of about {n_frames} frames of {video.name} could be read: if it is longer "
+                f"than that, copy it again, and remove {folder}"
             )
     finally:
         capture.release()

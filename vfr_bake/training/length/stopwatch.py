@@ -7,7 +7,8 @@ from collections import deque
 
 LONGEST_STEP, TIMES_MEDIAN = 5.0, 20.0
 """Seconds that a step counts at most, or TIMES_MEDIAN times the median of the last steps, if that is more. A
-step that took longer was interrupted: its process was stopped, or the machine slept."""
+step that takes longer was interrupted: its process was stopped, the machine slept, or a slow disk was written
+to in between."""
 N_LAST = 15
 """Number of last steps of which the median is taken."""
 

@@ -142,4 +142,7 @@ def test_a_copy_that_was_made_smaller_shows_the_same(tmp_path: Path) -> None:
     looks = look_at(paths, KeptMatches(tmp_path / "kept"), None)
     sizes = [(look.sensor.width, look.sensor.height) for look in looks]
     thumbnails = np.stack([look.thumbnail for look in looks])
-    assert repeats([look.features for look in looks], sizes, thumbnails, [3.0, 1.0, 2.0]) == {0: 1}
+    features = [look.features for look in looks]
+    assert repeats(features, sizes, thumbnails, [3.0, 1.0, 2.0]) == {0: 1}
+    rounded = [(639, 480), *sizes[1:]]
+    assert repeats([features[1], *features[1:]], rounded, thumbnails[[1, 1, 2]], [3.0, 1.0, 2.0]) == {1: 0}

@@ -95,7 +95,7 @@ def test_a_hole_in_one_picture_is_masked_and_told_of(tmp_path: Path) -> None:
     scene = load_scene(folder, reader=PictureReader(say=said.append))
     assert scene.unbounded and scene.masked
     assert [text for text in said if text.startswith("less than half of the pictures have transparent")]
-    assert load_scene_as({"kind": "object"}, folder).has_alpha
+    assert load_scene_as({}, False, folder).has_alpha and load_scene_as({}, True, folder).masked
 
 
 def test_everything_masked(tmp_path: Path) -> None:

@@ -110,8 +110,8 @@ def test_a_video_that_ends_early_is_told_of(
     said: list[str] = []
     folder = video.extract_frames(short_video, lambda done, of: None, said.append)
     expected = (
-        "12 of about 14 frames of walk.avi could be read: the file may be damaged: copy it again, and remove "
-        + str(folder)
+        "12 of about 14 frames of walk.avi could be read: if it is longer than that, copy it again, and "
+        f"remove {folder}"
     )
     assert said == ([expected] if told else [])
 
