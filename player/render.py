@@ -351,12 +351,12 @@ def check_choice(name: str, value: object, allowed: tuple[str, ...]) -> None:
         raise ConfigError(f"{name}: expected {', '.join(allowed[:-1])} or {allowed[-1]}, got {brief(value)}")
 
 
-def checked_background(value: object) -> Background:
+def checked_background(value: Any) -> Background:
     """Return a background as a frame has it: "transparent" or three floats. Raises ConfigError."""
     if isinstance(value, str) and value == "transparent":
         return "transparent"
     try:
-        red, green, blue = (float(number) for number in value)  # type: ignore[attr-defined]
+        red, green, blue = (float(number) for number in value)
     except (TypeError, ValueError):
         red = green = blue = math.nan
     if not all(0 <= number <= 1 for number in (red, green, blue)):

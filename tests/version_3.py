@@ -3,7 +3,6 @@ same bytes as the writer of that time."""
 
 from __future__ import annotations
 
-import hashlib
 import io
 import json
 import shutil
@@ -13,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from player.asset.asset import Asset
-from player.asset.manifest import FileEntry, Manifest, manifest_bytes
+from player.asset.manifest import Manifest, file_entry, manifest_bytes
 from player.asset.pyramid import PyramidValues
 from player.asset.single_level import VertexBricks
 from player.asset.version_3.unpacking import DENSITIES, FEATURES, PLACES
@@ -85,6 +84,6 @@ def manifest_3(manifest: Manifest, files: dict[str, bytes]) -> bytes:
     for key in KEYS_OF_4:
         del document[key]
     document["n_samples"] = document.pop("n_fetches")
-    entries = {name: FileEntry(len(data), hashlib.sha256(data).hexdigest()) for name, data in files.items()}
+    entries = {name: file_entry(data) for name, data in files.items()}
     document["files"] = {name: vars(entry) for name, entry in entries.items()}
     return json.dumps(document | {"version": [3, 1]}, sort_keys=True, indent=1).encode()

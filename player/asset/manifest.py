@@ -44,6 +44,7 @@ manifest of version 3.x calls `n_fetches` `n_samples`, and has no levels and no 
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 import re
@@ -95,6 +96,15 @@ class FileEntry:
 
     bytes: int
     sha256: str
+
+
+def file_entry(data: bytes) -> FileEntry:
+    """Return the entry of a file that holds `data`.
+
+    >>> file_entry(b"four").bytes
+    4
+    """
+    return FileEntry(len(data), hashlib.sha256(data).hexdigest())
 
 
 @dataclass(frozen=True, kw_only=True)

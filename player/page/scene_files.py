@@ -13,13 +13,12 @@ holds the same values.
 
 from __future__ import annotations
 
-import hashlib
 import json
 from dataclasses import replace
 
 from player.asset.arranging import write_parts
 from player.asset.asset import Asset
-from player.asset.manifest import NAME, VERSION, FileEntry, manifest_bytes
+from player.asset.manifest import NAME, VERSION, file_entry, manifest_bytes
 from player.cameras.views import asset_cameras
 from player.errors import ConfigError, FormatError
 from player.head.head import asset_head
@@ -54,7 +53,7 @@ def scene_files(asset: Asset) -> dict[str, bytes]:
         written = write_parts(stored.densities, stored.features, manifest, 0, 0)
         manifest = replace(manifest, parts=tuple(each.part for each in written))
         files |= {each.part.file: each.data for each in written}
-    entries = {name: FileEntry(len(data), hashlib.sha256(data).hexdigest()) for name, data in files.items()}
+    entries = {name: file_entry(data) for name, data in files.items()}
     document = manifest_bytes(replace(manifest, version=VERSION, files=entries, provenance={}))
     compact = json.dumps(json.loads(document), separators=(",", ":")).encode()
     return {MANIFEST: compact, **files}

@@ -8,13 +8,12 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from hashlib import sha256
 from pathlib import Path
 
 import numpy as np
 
 from player.asset.asset import Asset, GridArrays
-from player.asset.manifest import FileEntry, Manifest
+from player.asset.manifest import Manifest, file_entry
 from player.cameras.camera import Camera
 from player.errors import TrainingError
 from player.render import Renderer
@@ -149,5 +148,5 @@ def unwritten_asset(folder: Path, manifest: Manifest, arrays: GridArrays, files:
     """
     for name, data in files.items():
         (folder / name).write_bytes(data)
-    entries = {name: FileEntry(len(data), sha256(data).hexdigest()) for name, data in files.items()}
+    entries = {name: file_entry(data) for name, data in files.items()}
     return Asset(folder, replace(manifest, files=entries), arrays)

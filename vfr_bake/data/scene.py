@@ -139,10 +139,16 @@ def _check_cameras(name: str, cameras: list[Camera]) -> None:
 
 def _spread(views: PosedImages) -> PosedImages:
     """Return at most N_LOOKED_AT of the views, spread evenly."""
-    n_views = len(views.cameras)
-    return views.some(
-        set(np.linspace(0, n_views - 1, min(n_views, N_LOOKED_AT)).round().astype(int).tolist())
-    )
+    return views.some(evenly(len(views.cameras), N_LOOKED_AT).tolist())
+
+
+def evenly(n_views: int, n_chosen: int) -> np.ndarray:
+    """Return the numbers of `n_chosen` of the views, spread evenly, or of all if there are no more.
+
+    >>> evenly(10, 4).tolist(), evenly(2, 4).tolist()
+    ([0, 3, 6, 9], [0, 1])
+    """
+    return np.linspace(0, n_views - 1, min(n_chosen, n_views)).round().astype(int)
 
 
 def _plain_border(views: PosedImages) -> tuple[float, float, float] | None:
@@ -177,11 +183,12 @@ def _camera_ball(cameras: list[Camera]) -> tuple[np.ndarray, float]:
         centre = middle  # nearly parallel views have no focus point that can be used
     n_views, distances = len(places), np.sort(np.linalg.norm(places - centre, axis=1))
     radius = float(np.quantile(distances, CAMERA_QUANTILE))
-    # Of few cameras, the quantile lies between the last two, so that one that strayed would count. But where
-    # all others are in one place, it did not stray.
-    strayed = distances[-1] > STRAYED * distances[-2] > 1e-3 * radius if n_views > 2 else False
-    if strayed and CAMERA_QUANTILE * (n_views - 1) > n_views - 2:
-        radius = float(distances[-2])
+    # With three to ten cameras the quantile lies between the last two, so that one that strayed would count.
+    # But where all others are in one place, it did not stray.
+    if CAMERA_QUANTILE * (n_views - 1) > n_views - 2 > 0:
+        last_but_one, last = distances[-2:].tolist()
+        if last > STRAYED * last_but_one > 1e-3 * radius:
+            radius = last_but_one
     return centre, radius
 
 

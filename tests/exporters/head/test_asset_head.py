@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -18,7 +17,7 @@ from exporters.head.asset_head import TOLERANCE, comparisons, head_bytes
 from exporters.head.onnx_head import head_onnx
 from exporters.head.ranges import activation_ranges
 from player.asset.asset import Asset
-from player.asset.manifest import FileEntry
+from player.asset.manifest import file_entry
 from player.errors import MissingExtraError, ParityError
 from player.head.head import Head
 from tests.exporters.head.test_onnx_head import inputs, random_head
@@ -36,7 +35,7 @@ def with_head(asset: Asset, folder: Path, data: bytes) -> Asset:
     """Return a copy of an asset in a new folder, with the head in `data`."""
     shutil.copytree(asset.folder, folder)
     (folder / "head.onnx").write_bytes(data)
-    entry = FileEntry(len(data), hashlib.sha256(data).hexdigest())
+    entry = file_entry(data)
     manifest = replace(asset.manifest, files=asset.manifest.files | {"head.onnx": entry})
     return replace(asset, folder=folder, manifest=manifest)
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from player.progress import Progress
 from vfr_bake.data.capture import PosedImages
-from vfr_bake.data.scene import Scene
+from vfr_bake.data.scene import Scene, evenly
 from vfr_bake.rendering.render import render_camera
 from vfr_bake.training.captures.picture_colours import fitted
 from vfr_bake.training.model_file import Model
@@ -122,12 +122,3 @@ def quick_psnr(
             )
             break
     return scores, lines
-
-
-def evenly(n_views: int, n_chosen: int) -> np.ndarray:
-    """Return the numbers of `n_chosen` of the views, spread evenly, or of all if there are no more.
-
-    >>> evenly(10, 4).tolist(), evenly(2, 4).tolist()
-    ([0, 3, 6, 9], [0, 1])
-    """
-    return np.linspace(0, n_views - 1, min(n_chosen, n_views)).round().astype(int)
