@@ -184,10 +184,7 @@ def test_links_to_one_picture_are_different_pictures(tmp_path: Path):
     """A cache of downloads keeps equal pictures once, and links to them."""
     folder = make_folder(tmp_path / "a", 4)
     (folder / "r_3.png").unlink()
-    try:
-        (folder / "r_3.png").symlink_to(folder / "r_1.png")
-    except OSError:
-        pytest.skip("needs the right to make links")
+    (folder / "r_3.png").symlink_to(folder / "r_1.png")
     assert names(load_scene(folder).train) == "0 1 2 3"
 
 
