@@ -19,6 +19,7 @@ import pytest
 from PIL import Image
 
 from tests.benchmarks.pages.beside import beside
+from tests.benchmarks.pages.cells import lettered
 from tests.benchmarks.pages.documents import BESIDE, BLOCK, BLOCKS, DOCUMENTS, prose, rendered, rendered_files
 from tests.benchmarks.pages.plots import plots
 from tests.benchmarks.peers.compare import N_PIXELS, chosen_pixels, write_nerfstudio
@@ -97,7 +98,7 @@ def test_a_page_without_results_names_the_commands() -> None:
 def result(figures: dict[str, Any], *commands: str, **conditions: Any) -> dict[str, Any]:
     """Return a part's result in the form in which it is recorded."""
     versions = dict.fromkeys(("python", "numpy", "numba", "onnxruntime", "torch"), "1.0")
-    usual = {"commit": "0a1b2c3d4e", "machine": MACHINE, "others_before": 0.0, "others": 0.01}
+    usual = {"commit": "0a1b2c3d4e", "machine": MACHINE, "letter": "A", "others_before": 0.0, "others": 0.01}
     kept = dict.fromkeys(KEYS) | usual | {"date": "2026-11-24", "libraries": versions, "commands": commands}
     return kept | {"figures": figures} | conditions
 
@@ -166,7 +167,7 @@ def test_a_row_tells_machine_commit_and_what_ran_beside() -> None:
     assert lines[-1] == "Not measured yet: train_fox, train_can, train_demo (`make benchmarks`)."
     results["train_lego"] = result(trained, command, machine=MACHINE | {"cores": 4}, others=0.4)
     assert "| A*, 0a1b2c3 |" in BLOCKS["training"](results)[2]
-    assert len(BLOCKS["machines"](results)) == 4
+    assert len(BLOCKS["machines"](lettered(results)[0])) == 4
 
 
 def test_two_processors_stand_side_by_side() -> None:
@@ -174,7 +175,7 @@ def test_two_processors_stand_side_by_side() -> None:
     first = {"bake_lego_fast": result(baked), "page_lego_fast": result({"first_picture_s": 2.0})}
     other = MACHINE | {"processor": "another"}
     second = {"bake_lego_fast": result(baked | {"seconds": 480.0}, machine=other)}
-    assert beside(first, second) == [
+    assert beside(*lettered(first, second)) == [
         "| what | one, 2 cores; 0a1b2c3 | another, 2 cores; 0a1b2c3 |",
         "|---|---|---|",
         "| lego, fast: bake | 192 s, 4.9 MB, loses 0.10 ± 0.04 dB | 8.0 min, 4.9 MB, loses 0.10 ± 0.04 dB |",
@@ -187,13 +188,23 @@ def test_rows_name_the_machine_where_a_second_file_has_several() -> None:
         "page_lego_fast": result({"first_picture_s": 2.0}, machine=MACHINE | {"processor": "another"}),
         "bake_lego_fast": result(baked, machine=MACHINE | {"processor": "a third"}, others=0.4),
     }
-    assert beside({"bake_lego_fast": result(baked)}, second) == [
+    assert beside(*lettered({"bake_lego_fast": result(baked)}, second)) == [
         "| what | one, 2 cores; 0a1b2c3 | B: another, 2 cores; C: a third, 2 cores |",
         "|---|---|---|",
         "| lego, fast: bake | 192 s, 4.9 MB, loses 0.10 ± 0.04 dB |"
         " 192 s, 4.9 MB, loses 0.10 ± 0.04 dB (C*, 0a1b2c3) |",
         "| lego, fast: first picture of the page |  | 2.0 s (B, 0a1b2c3) |",
     ]
+
+
+def test_a_part_that_the_first_file_lacks_is_of_the_second() -> None:
+    features = {"psnr": 31.0, "n_views": 12, "steps": 300, "minutes": 3.0}
+    found: dict[str, Any] = {"features": features, "colour": features | {"psnr": 30.0, "steps": 100}}
+    other = {"compositing_lego": result(found, machine=MACHINE | {"processor": "another"})}
+    text = "<!-- benchmarks: compositing -->\n<!-- /benchmarks -->"
+    row = "| lego, 3 minutes | B, 0a1b2c3 | 31.00 dB (12 views) | 30.00 dB (12 views) | 3.0 times as many |"
+    assert row in rendered(text, {"bake_lego_fast": result({})}, other)
+    assert "| A, 0a1b2c3 |" in rendered(text, {"compositing_lego": result(found)}, other)
 
 
 def test_the_readme_tells_what_the_parts_found() -> None:

@@ -7,7 +7,6 @@ from collections.abc import Iterator
 from tests.benchmarks.pages.cells import (
     duration,
     give_or_take,
-    letter,
     machines,
     megabytes,
     number,
@@ -52,24 +51,23 @@ def _figures(results: Results) -> Iterator[tuple[str, str, str]]:
             yield f"{asset_name(name)}: first picture of the page", duration(seconds), name
 
 
-def _column(results: Results, first: int) -> tuple[str, dict[str, str]]:
-    """Return the title of a file's column, and each figure by its name. If the file has several machines,
-    figures have their machine and commit; the machines' letters begin with that of number `first`."""
-    places = [f"{machine['processor']}, {machine['cores']} cores" for machine in machines(results)]
+def _column(results: Results) -> tuple[str, dict[str, str]]:
+    """Return the title of a file's column, and each figure by its name. If these figures are of several
+    machines, each has its machine and commit."""
     figures = {what: (figure, name) for what, figure, name in _figures(results)}
+    shown = {name: results[name] for _, name in figures.values()}
+    places = {at: f"{of['processor']}, {of['cores']} cores" for at, of in machines(shown).items()}
     if len(places) > 1:
-        title = "; ".join(f"{letter(first + index)}: {place}" for index, place in enumerate(places))
-        return title, {
-            what: f"{figure} ({where(results, name, first)})" for what, (figure, name) in figures.items()
-        }
-    commits = sorted({part["commit"][:7] for part in results.values()})
-    title = f"{' and '.join(places)}; {', '.join(commits)}"
+        title = "; ".join(f"{letter}: {place}" for letter, place in places.items())
+        return title, {what: f"{figure} ({where(results, name)})" for what, (figure, name) in figures.items()}
+    commits = sorted({part["commit"][:7] for part in shown.values()})
+    title = f"{' and '.join(places.values())}; {', '.join(commits)}"
     return title, {what: figure for what, (figure, _) in figures.items()}
 
 
 def beside(results: Results, second: Results) -> list[str]:
     """Return the lines of a table with a column for each of the two files of results."""
-    titles, columns = zip(_column(results, 0), _column(second, len(machines(results))), strict=True)
+    titles, columns = zip(_column(results), _column(second), strict=True)
     told = [name for name in columns[0] if name in columns[1]]
     told += [name for name in columns[1] if name not in columns[0]]
     rows = [[name, *(column.get(name, "") for column in columns)] for name in told]

@@ -84,25 +84,30 @@ def gigabytes(mb: float) -> str:
     return f"{mb / 1000:.1f} GB"
 
 
-def machines(results: Results) -> list[dict[str, Any]]:
-    """Return the machines of all parts, each once, in the order of their letters from A on."""
-    found: list[dict[str, Any]] = []
-    for part in results.values():
-        if part["machine"] not in found:
-            found.append(part["machine"])
+def lettered(*files: Results) -> list[Results]:
+    """Return files of results whose parts also have their machine's letter: A for the machine of the first
+    part, and the next letter for each machine that was not met before."""
+    met: list[dict[str, Any]] = []
+    found: list[Results] = []
+    for results in files:
+        for part in results.values():
+            if part["machine"] not in met:
+                met.append(part["machine"])
+        found.append({n: p | {"letter": chr(ord("A") + met.index(p["machine"]))} for n, p in results.items()})
     return found
 
 
-def letter(index: int) -> str:
-    return chr(ord("A") + index)
+def machines(results: Results) -> dict[str, dict[str, Any]]:
+    """Return the machines of all parts by their letters."""
+    found = {part["letter"]: part["machine"] for part in results.values()}
+    return {letter: found[letter] for letter in sorted(found)}
 
 
-def where(results: Results, name: str, first: int = 0) -> str:
-    """Return machine and commit of a part, with * if other programs took more than counts as quiet. The
-    machines' letters begin with the letter of number `first`."""
+def where(results: Results, name: str) -> str:
+    """Return machine and commit of a part, with * if other programs took more than counts as quiet."""
     part = results[name]
     beside = "*" if max(part["others"], part["others_before"]) > QUIET else ""
-    return f"{letter(first + machines(results).index(part['machine']))}{beside}, {part['commit'][:7]}"
+    return f"{part['letter']}{beside}, {part['commit'][:7]}"
 
 
 def measured_on(results: Results, names: Sequence[str]) -> list[str]:

@@ -14,6 +14,7 @@ from pathlib import Path
 from player.files.files import write_bytes
 from tests.benchmarks.pages import tables, trade
 from tests.benchmarks.pages.beside import beside
+from tests.benchmarks.pages.cells import lettered
 from tests.benchmarks.pages.plots import plots
 from tests.benchmarks.suite.conditions import REPOSITORY
 from tests.benchmarks.suite.results import Results
@@ -27,12 +28,15 @@ BLOCK = re.compile(r"(<!-- benchmarks: ([\w-]+) -->\n).*?(<!-- /benchmarks -->)"
 def rendered(text: str, results: Results, second: Results) -> str:
     """Return a document with its blocks made anew. Raises KeyError for an unknown block.
 
-    `results`: of a processor without AVX-512; `second`: of one with it.
+    `results`: of a processor without AVX-512; `second`: of one with it, whose parts also stand in for those
+    that `results` lacks.
     """
+    results, second = lettered(results, second)
+    whole = results | {name: part for name, part in second.items() if name not in results}
 
     def block(found: re.Match[str]) -> str:
         name = found[2]
-        lines = BESIDE[name](results, second) if name in BESIDE else BLOCKS[name](results)
+        lines = BESIDE[name](results, second) if name in BESIDE else BLOCKS[name](whole)
         return "\n".join([found[1], *lines, "", found[3]])
 
     return BLOCK.sub(block, text)

@@ -12,7 +12,6 @@ from tests.benchmarks.pages.cells import (
     duration,
     gigabytes,
     give_or_take,
-    letter,
     machines,
     measured_on,
     megabytes,
@@ -57,13 +56,13 @@ def own_setting(results: Results, part: str, quality: str = "exact") -> dict[str
 
 def machine_table(results: Results) -> list[str]:
     rows = []
-    for index, machine in enumerate(machines(results)):
+    for letter, machine in machines(results).items():
         parts = [part for part in results.values() if part["machine"] == machine]
         versions = [(name, {part["libraries"][name] for part in parts}) for name in VERSIONS]
         told = ", ".join(f"{name} {' and '.join(sorted(some))}" for name, some in versions)
         dates = sorted({part["date"] for part in parts})
         days = dates[0] if len(dates) == 1 else f"{dates[0]} to {dates[-1]}"
-        row = [letter(index), machine["processor"], f"{machine['cores']}, {machine['memory_gb']} GB"]
+        row = [letter, machine["processor"], f"{machine['cores']}, {machine['memory_gb']} GB"]
         rows.append([*row, " ".join(machine["features"]), told, days])
     titles = ["name", "processor", "cores, memory", "features", "versions", "measured on"]
     return titled(titles, rows, []) if rows else missing(["train_lego"])[1:]
@@ -89,14 +88,16 @@ def training(results: Results) -> list[str]:
 
 
 def minutes(results: Results) -> list[str]:
-    names = {**{f"{m:g}": f"lego_{m:g}" for m in MINUTES}, "9.25": "lego"}
-    needed = [f"{kind}_{name}" for name in names.values() for kind in ("train", "eval")]
-    _, lacking = present(results, needed)
+    names = {f"{m:g}": f"lego_{m:g}" for m in MINUTES}
+    there, lacking = present(
+        results, [f"{kind}_{name}" for name in names.values() for kind in ("train", "eval")]
+    )
     if lacking:
         return missing(lacking)[1:]
     steps = [f"{results[f'train_{name}']['figures']['steps']:,}" for name in names.values()]
     scores = [f"{results[f'eval_{name}']['figures']['psnr']:.2f}" for name in names.values()]
-    return titled(["minutes", *names], [["steps", *steps], ["PSNR, dB", *scores]], [])
+    lines = titled(["minutes", *names], [["steps", *steps], ["PSNR, dB", *scores]], [])
+    return [*lines, *measured_on(results, there)]
 
 
 def compositing(results: Results) -> list[str]:
