@@ -7,7 +7,7 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -62,13 +62,16 @@ def train_command(options: Any) -> int:
     # The pictures of a ZIP or a video can be looked at only once they are unpacked.
     packed = not Path(options.data).is_dir()
     glance = _glance(options.data, config) if processes.first and not packed else None
-    data = processes.in_turn(lambda: _with_cameras(options.data, config.scale))
+    # Masks of no picture are found when cameras are estimated, and again when the pictures are read. What has
+    # been said is kept, and is not said again.
+    say = cache(partial(_say, options.data))
+    data = processes.in_turn(lambda: _with_cameras(options.data, say, config.scale))
     if processes.first and packed:
         glance = _glance(data, config)
     if glance is not None:
         glance()  # the pictures are bad, but their cameras were found nevertheless
-    say = partial(_say, options.data) if processes.first else None
-    reader = training_reader(config, options.model, kept=not options.no_cache, say=say)
+    told = say if processes.first else None
+    reader = training_reader(config, options.model, kept=not options.no_cache, say=told)
     with Bar("reading pictures", processes.first) as bar:
         scene = processes.in_turn(
             lambda: load_scene(data, bar.count, kind=config.kind, scale=config.scale, reader=reader)
@@ -187,10 +190,12 @@ def _say(data: str, text: str) -> None:
     print(f"vfr-train: {printable(f'{data}: {text}')}", file=sys.stderr)
 
 
-def _with_cameras(data: str, scale: tuple[str, str, float] | None = None) -> str:
+def _with_cameras(
+    data: str, say: Callable[[str], object] | None = None, scale: tuple[str, str, float] | None = None
+) -> str:
     """Return the folder to load. Unpack a ZIP first, and estimate the cameras of photographs or a video that
     have none, after looking for the pictures that `scale` names. What stays as it is keeps its name: `./demo`
-    is a folder, and `demo` the built-in scene."""
+    is a folder, and `demo` the built-in scene. `say`: called with a sentence on what the estimation found."""
     from vfr_bake.data import check_scale, needs_cameras, unpacked
     from vfr_bake.data.poses import added_since, estimate_cameras
 
@@ -212,7 +217,7 @@ def _with_cameras(data: str, scale: tuple[str, str, float] | None = None) -> str
     if scale is not None and folder.is_dir():
         check_scale(folder, scale)
     with Bars() as bars:
-        report = estimate_cameras(Path(data), bars.count, partial(_say, data))
+        report = estimate_cameras(Path(data), bars.count, say)
     print(f"vfr-train: {printable(report.summary())}", file=sys.stderr)
     for name, reason in report.unplaced.items():
         print(f"vfr-train:   no place for {printable(name)}: {printable(reason)}", file=sys.stderr)

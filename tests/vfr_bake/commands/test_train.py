@@ -1,8 +1,9 @@
-"""Interrupted trainings: what is kept, what is said, and how they go on."""
+"""Trainings: what is said before they begin, what is kept if they are interrupted, and how they go on."""
 
 from __future__ import annotations
 
 import json
+import shutil
 import signal
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,8 @@ import torch
 
 from player.errors import OutputError
 from vfr_bake.cli import train_main
+from vfr_bake.data.files.masks import stray_masks
+from vfr_bake.data.poses import PoseReport
 from vfr_bake.training.checkpoint import checkpoint_path
 from vfr_bake.training.model_file import load_model
 from vfr_bake.training.trainer import Trainer
@@ -25,6 +28,27 @@ SMALL = [
 
 def interrupt(*_: Any) -> None:
     raise KeyboardInterrupt
+
+
+def test_masks_of_no_picture_are_told_of_once(
+    small_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """In a first run both the estimation of the cameras and the reading of the pictures find them."""
+    photos = shutil.copytree(small_data, tmp_path / "photos")
+    (photos / "masks").mkdir()
+    (photos / "masks" / "stray.png").write_bytes(b"")
+    (photos / "transforms_test.json").unlink()
+    cameras = (photos / "transforms_train.json").rename(tmp_path / "transforms_train.json")
+
+    def estimate(folder: Path, progress: Any, say: Any) -> PoseReport:
+        say(stray_masks(folder, []))
+        cameras.rename(photos / cameras.name)
+        return PoseReport(folder, 12, 12, 0.5, 3.0)
+
+    monkeypatch.setattr("vfr_bake.data.poses.estimate_cameras", estimate)
+    monkeypatch.setattr("vfr_bake.commands.train._warn_of_folds", interrupt)
+    assert train_main([str(photos), str(tmp_path / "model.pt"), *SMALL]) == 130
+    assert capsys.readouterr().err.count("1 of 1 masks belong to no picture (stray.png)") == 1
 
 
 def press_in_step(step: int, times: int, monkeypatch: pytest.MonkeyPatch) -> None:
