@@ -49,5 +49,7 @@ def render_job(renderer: Renderer, job: Job) -> Done:
     start = time.perf_counter()
     frame = renderer.render(job.camera, job.samples, job.background, quality=job.quality)
     milliseconds = (time.perf_counter() - start) * 1000
-    data = ENCODERS[job.suffix](frame.to_uint8(), job.key)
+    pixels = frame.to_uint8()
+    del frame  # frees its memory before the encoder takes as much or more
+    data = ENCODERS[job.suffix](pixels, job.key)
     return Done(job.index, data, milliseconds, renderer.march, renderer.n_threads)

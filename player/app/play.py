@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 from player.app.frame_files import Target, frame_key, unfinished, video_key
 from player.app.jobs import Done, Job, render_job
-from player.app.options import PlaySettings
+from player.app.options import VIDEO, PlaySettings
 from player.asset.asset import Asset
 from player.cameras.camera import Camera
 from player.errors import ConfigError
@@ -22,7 +22,11 @@ from player.files.files import write_bytes
 from player.render import FRAME_BYTES, Renderer, check_size
 
 LARGE_BYTES = 1e9
-"""A line warns before a picture is rendered that takes this many bytes of memory or more."""
+"""A line warns before a picture is rendered, or a video, that takes this many bytes of memory or more."""
+MEMORY_BYTES = {".png": FRAME_BYTES, ".webp": 50, VIDEO: 240}
+"""Most memory of a picture or a video while it is made, in bytes per pixel, by its suffix. WebP's encoder
+takes 38 to 44 besides the 8-bit picture, which is all that is left of the frame by then. That of H.264
+compares dozens of pictures: it takes 190 to 225 for a film of 60 or more."""
 
 Say = Callable[[str], object]
 Advance = Callable[[int, int, float], object]
@@ -148,9 +152,10 @@ def _check_sizes(cameras: Sequence[Camera], target: Target, say: Say) -> None:
     if target.is_video and len(sizes) > 1:
         raise ConfigError(f"{target.path}: expected views of one size for a video, got {sizes}: add --size")
     width, height = max(sizes, key=math.prod)
-    n_bytes = width * height * FRAME_BYTES
+    what, suffix = ("video", VIDEO) if target.is_video else ("picture", target.suffix)
+    n_bytes = width * height * MEMORY_BYTES[suffix]
     if n_bytes >= LARGE_BYTES:
-        say(f"a picture of {width}x{height} takes {n_bytes / 1e9:.1f} GB of memory")
+        say(f"a {what} of {width}x{height} takes {n_bytes / 1e9:.1f} GB of memory")
 
 
 def _figures(asset: Asset, camera: Camera, done: list[Done], settings: PlaySettings) -> dict[str, Any]:

@@ -13,7 +13,6 @@ import time
 import weakref
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -21,9 +20,10 @@ import pytest
 from PIL import Image
 
 from player.app import cli
+from player.app.frame_files import Target
 from player.app.jobs import Done, Job, render_job
 from player.app.options import PlaySettings
-from player.app.play import LARGE_BYTES, _check_sizes, play
+from player.app.play import LARGE_BYTES, MEMORY_BYTES, _check_sizes, play
 from player.app.video import write_video
 from player.asset.asset import Asset
 from player.cameras.camera import orbit
@@ -136,22 +136,74 @@ def test_settings_with_numbers_of_any_kind_resume_a_run(
         assert play(asset, asset_cameras(asset), settings).n_kept == 5
 
 
-def test_a_picture_that_takes_much_memory_is_told_of(asset: Asset) -> None:
+@pytest.mark.parametrize(
+    ("name", "what", "n_bytes"),
+    [("turn", "picture", FRAME_BYTES), ("a.webp", "picture", 50), ("turn.mp4", "video", 240)],
+)
+def test_what_takes_much_memory_is_told_of(asset: Asset, name: str, what: str, n_bytes: int) -> None:
     """The largest picture asked for is reported if it takes much memory, whatever the order of pictures."""
     small = read_cameras(asset.path("cameras.json"))[0]
-    pixels = math.ceil(LARGE_BYTES / FRAME_BYTES)
+    target = Target.of(PlaySettings(Path(name)))
+    pixels = math.ceil(LARGE_BYTES / n_bytes)
     wide, square = (
         small.resized(pixels // 100 + 1, 100),
         small.resized(math.isqrt(pixels) - 1, math.isqrt(pixels) - 1),
     )
     said: list[str] = []
-    _check_sizes([small, square], SimpleNamespace(is_video=False), said.append)
+    _check_sizes([square] if target.is_video else [small, square], target, said.append)
     assert not said
-    for cameras in ([wide, small, square], [square, small, wide], [wide]):
+    for cameras in [[wide]] if target.is_video else [[wide, small, square], [square, small, wide], [wide]]:
         said.clear()
-        _check_sizes(cameras, SimpleNamespace(is_video=False), said.append)
-        gigabytes = wide.width * 100 * FRAME_BYTES / 1e9
-        assert said == [f"a picture of {wide.width}x100 takes {gigabytes:.1f} GB of memory"]
+        _check_sizes(cameras, target, said.append)
+        gigabytes = wide.width * 100 * n_bytes / 1e9
+        assert said == [f"a {what} of {wide.width}x100 takes {gigabytes:.1f} GB of memory"]
+
+
+PEAK = """
+import sys
+from pathlib import Path
+import numpy as np
+from player.app.jobs import Job, render_job
+from player.app.play import peak_rss_mb
+from player.app.video import write_video
+from player.render import Frame
+
+class Noise:
+    march, n_threads = "", 1
+
+    def render(self, n, *_, **__):
+        planes = (np.zeros((n, n), np.float32) for _ in range(3))
+        return Frame(np.random.default_rng(0).random((n, n, 3), np.float32), *planes, (0.0, 0.0, 0.0))
+
+def make(n):
+    if path.suffix != ".mp4":
+        render_job(Noise(), Job(0, n, None, None, "exact", "", path.suffix))
+    else:
+        wave = np.uint8(127 + 120 * np.sin(np.arange(n) / 9))
+        picture = np.add.outer(wave, wave)[..., None].repeat(3, -1)
+        write_video(path, (np.roll(picture, 7 * i, 1) for i in range(60)), 30, "")
+
+path = Path(sys.argv[1])
+make(32)  # imports and compiles
+before = peak_rss_mb() or 0
+make(int(sys.argv[2]))
+print(1e6 * ((peak_rss_mb() or 0) - before))
+"""
+"""Prints the bytes of memory that it takes to make a picture or a video of so many pixels a side; less where
+the system tells a process only of a peak that it has inherited, or of none."""
+
+
+@pytest.mark.parametrize(
+    ("name", "side"), [("a.webp", 1500), pytest.param("a.mp4", 768, marks=pytest.mark.extra)]
+)
+def test_making_a_picture_or_a_video_takes_no_more_memory_than_is_told(
+    name: str, side: int, tmp_path: Path
+) -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", PEAK, str(tmp_path / name), str(side)],
+        env=os.environ | {"PYTHONPATH": str(REPOSITORY)}, check=True, capture_output=True, text=True,
+    )  # fmt: skip
+    assert float(done.stdout) <= MEMORY_BYTES[Path(name).suffix] * side**2
 
 
 def test_one_picture_wants_one_view(
