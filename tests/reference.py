@@ -103,3 +103,9 @@ def composite_ray(sigmas: np.ndarray, features: np.ndarray, step: float) -> tupl
         total += np.exp(-tau) * -np.expm1(-delta) * feature
         tau += delta
     return total, -np.expm1(-tau)
+
+
+def contract(point: np.ndarray) -> np.ndarray:
+    """Contract a point [3] by equation 10 of mip-NeRF 360; it must be finite."""
+    norm = np.linalg.norm(point)
+    return point if norm <= 1 else (2 - 1 / norm) * point / norm

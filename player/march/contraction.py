@@ -11,32 +11,6 @@ from __future__ import annotations
 import numpy as np
 
 
-def contract(points: np.ndarray, divisor: np.ndarray | float = 1.0) -> np.ndarray:
-    """Contract points.
-
-    Args:
-        points: [..., 3] float32 or float64, any size; a coordinate may be infinite.
-        divisor: [...] >= 0, the numbers that the points are to be divided by. 0 means infinitely far away in
-            the direction of the point, which must not be 0 itself then.
-
-    Returns:
-        [..., 3] contracted points in the dtype of `points`, inside the ball of radius 2.
-
-    >>> contract(np.array([[0.5, 0, 0], [0, 4, 0], [0, 0, -np.inf]])).tolist()
-    [[0.5, 0.0, 0.0], [0.0, 1.75, 0.0], [0.0, 0.0, -2.0]]
-    """
-    infinite = np.isinf(points)
-    endless = np.asarray(infinite.any(axis=-1))
-    v = np.where(endless[..., None], np.copysign(infinite, points), points).astype(points.dtype)
-    h = np.where(endless, 0, divisor).astype(points.dtype)
-    largest = np.maximum(
-        np.abs(v).max(axis=-1), h
-    )  # v and h are divided by it first: the square of 1e30 is beyond float32
-    largest = np.where(largest > 0, largest, 1)
-    v, h = v / largest[..., None], h / largest
-    return v * contraction_scale(np.sqrt(np.sum(v * v, axis=-1)), h)[..., None]
-
-
 def contraction_scale(norm: np.ndarray, divisor: np.ndarray) -> np.ndarray:
     """Return the factor [...] by which v is multiplied to contract v / h, from q = |v| and the divisor h,
     both [...] and not both 0."""
@@ -52,7 +26,7 @@ def pull_back(gradients: np.ndarray, v: np.ndarray, divisor: np.ndarray) -> np.n
 
     Args:
         gradients: [3, n] with respect to c(x).
-        v: [3, n] and divisor [n]: the points x = v / h, as `contract` takes them.
+        v: [3, n] and divisor [n]: the points x = v / h.
 
     Returns:
         [3, n] with respect to x.

@@ -15,9 +15,9 @@ from player.asset.asset import Asset
 from player.cameras.camera import Camera
 from player.compiled import march as march_compiled
 from player.march.contracted import enter_space
-from player.march.contraction import contract
 from player.progress import silent
 from player.render import render
+from tests.reference import contract
 from tests.vfr_bake.baking.scenes import trained
 from vfr_bake.baking.bake import _Bake, bake
 from vfr_bake.baking.cells import lattice_step, rays_of_contracted_views, weighty_cells

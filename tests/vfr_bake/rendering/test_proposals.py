@@ -8,7 +8,7 @@ import torch
 
 from player.march.march import OPAQUE_DEPTH
 from tests.numerics.bounds import Row
-from tests.reference import composite_ray
+from tests.reference import composite_ray, contract
 from tests.vfr_bake import twins
 from vfr_bake.config import FieldOptions
 from vfr_bake.field.field import VfrField
@@ -24,12 +24,6 @@ SPACING = Row(
     "Field", "distance of a proposal's spacing, in float64", "t from 0 to the farthest", 1e-12, "of it",
     "without a seam at t = 1; below 1e-3, 1e-15",
 )  # fmt: skip
-
-
-def contract(point: np.ndarray) -> np.ndarray:
-    """Evaluate equation 10 of mip-NeRF 360 in float64."""
-    norm = np.linalg.norm(point)
-    return point if norm <= 1 else (2 - 1 / norm) * point / norm
 
 
 @pytest.mark.parametrize("size", [0.0, 1e-30, 0.3, 0.999, 1.0, 1.001, 2.0, 1e3, 1e10, 1e30, 3e38])

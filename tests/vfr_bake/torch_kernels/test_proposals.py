@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 
+from tests.reference import contract
 from tests.vfr_bake.rendering.test_proposals import (
     HISTOGRAMS,
-    contract,
     make,
     naive_interlevel,
     naive_resample,
