@@ -94,9 +94,9 @@ def build_scene(capture: Capture, kind: SceneKind = "auto") -> Scene:
     if unbounded:
         centre, half = _camera_ball(train.cameras)
     else:
-        centre, half = scene_box(
-            *(some.cameras, [image[..., 3] for image in some.images]) if has_alpha else (train.cameras, None)
-        )
+        # The comparison makes a new array, so that no picture stays in memory for its silhouette.
+        silhouettes = [image[..., 3] > 0 for image in some.images] if has_alpha else None
+        centre, half = scene_box(some.cameras if has_alpha else train.cameras, silhouettes)
     world_from_model = np.eye(4)
     world_from_model[:3, :3] *= half
     world_from_model[:3, 3] = centre

@@ -8,8 +8,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from player.cameras.camera import Camera
 from player.errors import DataError, ShapeError
 from vfr_bake.config import SceneKind
+from vfr_bake.data.bounds import scene_box
 from vfr_bake.data.capture import Capture, PosedImages
 from vfr_bake.data.demo import demo_cameras, demo_views
 from vfr_bake.data.scene import NEAR_CAMERA, NEAR_QUANTILE, NEAR_SHARE, WHITE, _near, build_scene
@@ -128,6 +130,20 @@ def test_pictures_that_are_transparent_everywhere_are_refused():
         build_scene(Capture("a", nothing, test))
     one = PosedImages(train.cameras, [*nothing.images[:3], train.images[3]])
     assert build_scene(Capture("a", one, test)).has_alpha
+
+
+def test_silhouettes_keep_no_picture_in_memory(monkeypatch: pytest.MonkeyPatch):
+    """Pictures on the disk are read one by one, of which only the silhouettes are kept."""
+    train, test = demo_views(8, 4, 1)
+    bases = []
+
+    def boxed(cameras: list[Camera], silhouettes: list[np.ndarray]) -> tuple[np.ndarray, float]:
+        bases.extend(silhouette.base for silhouette in silhouettes)
+        return scene_box(cameras, silhouettes)
+
+    monkeypatch.setattr("vfr_bake.data.scene.scene_box", boxed)
+    build_scene(Capture("a", train, test))
+    assert bases == [None] * 4
 
 
 def test_an_unbounded_scene_has_its_cameras_in_the_unit_ball():
