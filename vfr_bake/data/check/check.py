@@ -22,7 +22,7 @@ from vfr_bake.data.check.turning import share_turned
 from vfr_bake.data.check.verdict import GOOD_SHARED, judged
 from vfr_bake.data.files.archives import is_archive, unpack
 from vfr_bake.data.files.estimate_record import read_record
-from vfr_bake.data.files.listing import find_pictures
+from vfr_bake.data.files.listing import find_pictures, other_kinds
 from vfr_bake.data.files.pictures import DescribedView, picture_size
 from vfr_bake.data.files.video import extract_frames
 from vfr_bake.data.folders import has_transforms, load_folder
@@ -196,7 +196,8 @@ def _listed(data: str, progress: Progress) -> _Set:
         if kind == "COLMAP":
             assert model is not None
             place, there = find_pictures(folder)
-            others = [path for path in there if path not in set(paths)]
+            known = set(paths)
+            others = [path for path in there if path not in known]
             names += [path.relative_to(place).as_posix() for path in others]
             paths = paths + others
             found += [False] * len(others)
@@ -206,7 +207,7 @@ def _listed(data: str, progress: Progress) -> _Set:
         return _Set(kind, names, paths, found, cameras, why)
     place, paths = find_pictures(folder)
     if not paths:
-        raise DataError(f"{folder}: expected a folder of pictures or a video, got none")
+        raise DataError(f"{folder}: expected a folder of pictures or a video, got none{other_kinds(folder)}")
     return _Set(
         "none yet", [path.relative_to(place).as_posix() for path in paths], paths, [None] * len(paths)
     )

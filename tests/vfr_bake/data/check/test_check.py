@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 import sys
-from pathlib import Path
+from pathlib import Path, PurePath
 
 import numpy as np
 import pytest
@@ -134,6 +134,26 @@ def test_a_picture_without_a_camera_is_not_read_by_training(tmp_path: Path) -> N
     check = checked(folder)
     assert check.verdict != BAD and check.figures["n_unreadable"] == 1
     assert not any("p00.jpg" in line for line in check.advice)
+
+
+def test_pictures_without_cameras_are_found_in_linear_time(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The check of a folder in which 40 of 50 pictures have no camera hashes no path more than a few times:
+    a folder may have thousands."""
+    folder = write_model(tmp_path / "toy", demo_cameras(24, 10))
+    for number in range(40):
+        (folder / "images" / f"p{number:02d}.jpg").write_bytes(b"")
+    n_hashed, whole = 0, PurePath.__hash__
+
+    def counted(path: PurePath) -> int:
+        nonlocal n_hashed
+        n_hashed += 1
+        return whole(path)
+
+    monkeypatch.setattr(PurePath, "__hash__", counted)
+    assert len(check_data(str(folder), WorkingSize(), seconds=0).pictures) == 50
+    assert n_hashed < 4 * 50
 
 
 def test_a_package_that_is_missing_is_no_fault_of_the_pictures(
