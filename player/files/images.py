@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import io
+import threading
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -81,6 +83,9 @@ MAX_FILE_BYTES = 1 << 30
 """The most bytes of a picture's file: 178 million pixels, the most that Pillow opens, of six bytes each."""
 
 
+_WARNINGS = threading.Lock()
+
+
 @contextmanager
 def open_picture(path: Path, formats: tuple[str, ...] = FORMATS) -> Iterator[Image.Image]:
     """Yield a picture file opened by Pillow.
@@ -92,7 +97,12 @@ def open_picture(path: Path, formats: tuple[str, ...] = FORMATS) -> Iterator[Ima
 
     with open_file(path, "a picture", MAX_FILE_BYTES) as file:
         try:
-            with Image.open(file, formats=formats) as picture:
+            # Pillow warns of half as many pixels as it refuses. Large cameras take such pictures. Only one
+            # thread at a time may change what is warned of.
+            with _WARNINGS, warnings.catch_warnings():
+                warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+                opened = Image.open(file, formats=formats)
+            with opened as picture:
                 yield picture
         except UnidentifiedImageError:
             expected = " or ".join(filter(None, (", ".join(formats[:-1]), formats[-1])))

@@ -117,6 +117,17 @@ def test_a_heic_of_too_many_pixels_is_not_decoded(tmp_path: Path, monkeypatch: p
         read_picture(path)
 
 
+@pytest.mark.parametrize("suffix", [".heic", ".jpg", ".png"])
+def test_a_picture_of_fewer_pixels_than_are_refused_is_read_without_a_warning(
+    suffix: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Pillow warns of pictures of half as many pixels as it refuses; in the tests a warning is an error."""
+    path = tmp_path / f"a{suffix}"
+    Image.fromarray(corners()).save(path)
+    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", corners()[..., 0].size - 1)
+    assert read_picture(path).shape[:2] == corners().shape[:2]
+
+
 # --- cameras that come with a data set ---
 
 
