@@ -1,7 +1,7 @@
 """Quality of exported surfaces: compared with known geometry, with the volume and with photographs.
 
-    python tests/benchmarks/bench_surface.py demo ASSET                    # an asset of the built-in scene
-    python tests/benchmarks/bench_surface.py views ASSET transforms_test.json [--pictures DIR] [--views 10]
+    python -m tests.benchmarks.bench_surface demo ASSET                     # an asset of the built-in scene
+    python -m tests.benchmarks.bench_surface views ASSET transforms_test.json [--pictures DIR] [--views 10]
 
 `demo`: mean and 95th percentile of the distance to the true surface, both ways, in the asset's voxels, and
 the mean angle between normals. The true surface is sampled where rays of training cameras end. Before that:
@@ -95,7 +95,7 @@ def caster(mesh: TriangleMesh) -> Any:
 
 
 def true_normals(points: np.ndarray) -> np.ndarray:
-    from vfr_bake.data.demo_solids import signed_distance
+    from tests.vfr_bake.data.solids import signed_distance
 
     steps = 1e-4 * np.eye(3)
     slopes = np.stack([signed_distance(points + e) - signed_distance(points - e) for e in steps], axis=-1)
@@ -132,7 +132,7 @@ def bench_levels(asset: Asset, points: np.ndarray) -> None:
 
 
 def bench_demo(asset: Asset, methods: list[str]) -> None:
-    from vfr_bake.data.demo_solids import signed_distance
+    from tests.vfr_bake.data.solids import signed_distance
 
     voxel = voxel_size(asset.grid) * asset.scale
     cameras = cameras_of(asset, None)[::8]

@@ -25,11 +25,10 @@ def scene_box(
     see there. With silhouettes, it is the box of the visual hull, with a margin of 1.5 cells of its grid.
 
     >>> from vfr_bake.data.demo import demo_views
-    >>> from vfr_bake.data.demo_solids import AABB
     >>> train, _ = demo_views(size=32, n_train=12, n_test=0)
     >>> centre, half = scene_box(train.cameras, [image[..., 3] for image in train.images])
-    >>> bool((centre - half < AABB[0]).all() and (centre + half > AABB[1]).all())
-    True
+    >>> centre.round(2).tolist(), round(half, 2)
+    ([0.45, -0.29, -0.1], 1.08)
     """
     centre, half = _seen_box(cameras)
     if alphas is None:

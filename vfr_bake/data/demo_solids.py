@@ -210,8 +210,6 @@ def _scene() -> list[Solid]:
 SOLIDS = _scene()
 LOW = np.array([-0.95, -0.95, -0.70])
 HIGH = np.array([0.95, 0.95, -0.6 + 0.86 + WIRE_RADIUS / SCALE])
-AABB = np.stack([CENTRE + SCALE * LOW, CENTRE + SCALE * HIGH])
-"""[2, 3]: the tight box of the whole scene, in world units."""
 
 
 def scene_distance(p: np.ndarray) -> np.ndarray:
@@ -223,21 +221,6 @@ def scene_distance(p: np.ndarray) -> np.ndarray:
 
 
 # --- rays and boxes ---
-
-
-def signed_distance(points: np.ndarray) -> np.ndarray:
-    """Return the distance to the nearest surface, negative inside.
-
-    It is exact outside. Inside, where solids touch, it is a bound with the right sign.
-
-    `points`: [n, 3] world units. Returns [n] float64, world units.
-
-    >>> ahead = BALL_CENTRE - [0, BALL_RADIUS + 0.1, 0]
-    >>> signed_distance(np.stack([ahead, BALL_CENTRE])).round(6).tolist()
-    [0.1, -0.256]
-    """
-    p = (np.asarray(points, np.float64).reshape(-1, 3).T - CENTRE[:, None]) / SCALE
-    return scene_distance(p) * SCALE
 
 
 def enter(

@@ -25,6 +25,7 @@ from player.march.march import march
 from player.render import render
 from tests.numerics.fog import fog
 from tests.vertex_grids import rows_of
+from tests.vfr_bake.data.solids import AABB, signed_distance
 from vfr_bake.baking.bake import BakeResult, _Bake, bake
 from vfr_bake.baking.cells import corners_of, pixel_footprints
 from vfr_bake.baking.distillation import (
@@ -50,7 +51,6 @@ from vfr_bake.baking.refinement import (
     train_head,
 )
 from vfr_bake.config import BakeConfig, FieldConfig
-from vfr_bake.data.demo_solids import AABB, signed_distance
 from vfr_bake.field.networks import HeadNetwork
 from vfr_bake.kernels.latent_rows import PARTS
 from vfr_bake.presets import PRESETS

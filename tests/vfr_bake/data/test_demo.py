@@ -9,11 +9,11 @@ from player.app.option_types import DEMO
 from player.asset.asset import Asset
 from player.cameras.camera import Camera
 from player.render import render
+from tests.vfr_bake.data.solids import AABB, signed_distance
 from vfr_bake.data import demo as module
 from vfr_bake.data import load_scene
 from vfr_bake.data.demo import demo_cameras, demo_capture, demo_scene, demo_views, trace
 from vfr_bake.data.demo_solids import (
-    AABB,
     BALL_CENTRE,
     BALL_RADIUS,
     CENTRE,
@@ -22,7 +22,6 @@ from vfr_bake.data.demo_solids import (
     HOLE_RADIUS,
     SCALE,
     WIRE_RADIUS,
-    signed_distance,
 )
 
 
