@@ -9,19 +9,15 @@ that no frame of another asset or of an incomplete copy slips in.
 from __future__ import annotations
 
 import asyncio
-import hashlib
 import threading
 from collections.abc import Iterator, Sequence
 from functools import lru_cache
-from pathlib import Path
 from typing import Any
 
 from player.app.jobs import Done, Job, render_job
 from player.app.options import PlaySettings
 from player.asset.asset import Asset
-from player.asset.manifest import MAX_BYTES, NAME
 from player.errors import ConfigError, FormatError, IntegrityError, MissingExtraError, VfrError
-from player.files.files import read_bytes
 from player.render import March, Renderer
 
 CONNECT_SECONDS = 10
@@ -63,7 +59,7 @@ def render_on_cluster(
         client = distributed.Client(address, timeout=CONNECT_SECONDS)
     except (OSError, TimeoutError, ValueError) as error:
         raise ConfigError(f"--dask: {address}: expected a scheduler to answer, got none: {error}") from error
-    which = str(asset.folder.resolve()), _digest(asset.folder), asset.n_parts
+    which = str(asset.folder.resolve()), asset.digest, asset.n_parts
     how = settings.threads, settings.march, settings.max_memory
     with client:
         futures = {client.submit(_task, job, *which, *how, pure=False): job for job in jobs}
@@ -95,8 +91,6 @@ def _result(future: Any, address: str, job: Job) -> Done:
 def _task(job: Job, folder: str, digest: str, n_parts: int, *how: Any) -> Done:
     """Render a frame on a worker; `how` are the last arguments of `_renderer`. The settings are not passed as
     a whole, because a path in them would not reach a worker of another system."""
-    if _digest(Path(folder)) != digest:
-        raise IntegrityError(f"{folder}: on a worker: expected the asset of the client, got another")
     with _OPENING:
         renderer = _renderer(folder, digest, n_parts, *how)
     return render_job(renderer, job)
@@ -109,7 +103,8 @@ def _renderer(
     """Return the worker's renderer, which is kept for the next frames; the digest tells a new asset from an
     old one.
 
-    Raises IntegrityError unless the asset has `n_parts` parts here: with fewer, frames would be coarser.
+    Raises IntegrityError unless the asset is the client's, with `n_parts` parts: with fewer, frames would be
+    coarser.
 
     Compiled code is proven first, because wrong code would end the worker's process.
     """
@@ -117,17 +112,15 @@ def _renderer(
         from player.proof import prove
 
         prove(lambda text: None)
-    asset = Asset.open(folder, max_memory=max_memory)
+    try:
+        asset = Asset.open(folder, max_memory=max_memory)
+    except FormatError as error:
+        raise IntegrityError(f"{error}: expected the asset at the same path on every worker") from error
+    if asset.digest != digest:
+        raise IntegrityError(f"{folder}: on a worker: expected the asset of the client, got another")
     if asset.n_parts != n_parts:
         raise IntegrityError(
             f"{folder}: on a worker: parts: expected {n_parts} as on the client, got {asset.n_parts}: "
             "copy the whole asset to every machine"
         )
     return Renderer(asset, threads, march)
-
-
-def _digest(folder: Path) -> str:
-    try:
-        return hashlib.sha256(read_bytes(folder / NAME, "a manifest", MAX_BYTES, folder)).hexdigest()
-    except FormatError as error:
-        raise IntegrityError(f"{error}: expected the asset at the same path on every worker") from error

@@ -19,12 +19,11 @@ import numpy as np
 from player.app.options import PICTURES, VIDEO, PlaySettings
 from player.app.video import load_av, read_video_key, write_video
 from player.asset.asset import Asset
-from player.asset.manifest import MAX_BYTES, NAME
 from player.cameras.camera import Camera
 from player.cameras.transforms import frame_names
 from player.errors import ConfigError, OutputError
 from player.files.content import content_of
-from player.files.files import check_target, read_bytes
+from player.files.files import check_target
 from player.files.images import open_picture, read_key
 from player.files.replace import clear_up
 
@@ -135,8 +134,7 @@ def frame_key(asset: Asset, camera: Camera, settings: PlaySettings) -> str:
     facts = [camera.c2w.tolist(), lens, k, behind, settings.quality]
     if asset.n_parts < len(asset.manifest.parts):  # the picture is coarser than one of the whole asset
         facts.append(asset.n_parts)
-    manifest = read_bytes(asset.folder / NAME, "a manifest", MAX_BYTES, asset.folder)
-    return hashlib.sha256(manifest + json.dumps(facts).encode()).hexdigest()
+    return hashlib.sha256(json.dumps([asset.digest, facts]).encode()).hexdigest()
 
 
 def video_key(keys: Sequence[str], fps: float) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -198,6 +199,11 @@ class Asset:
             m.near,
             skip_dead=True,
         )
+
+    @cached_property
+    def digest(self) -> str:
+        """A digest of the manifest as it was opened, and with it of all files, whose checksums it lists."""
+        return hashlib.sha256(manifest_bytes(self.manifest)).hexdigest()
 
     @property
     def most_samples(self) -> int:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 import threading
@@ -28,6 +29,7 @@ from player.asset.asset import Asset
 from player.cameras.camera import orbit
 from player.cameras.views import asset_cameras
 from player.errors import IntegrityError
+from tests.player.conftest import write_shells
 from tests.player.in_parts import write_in_parts
 
 REPOSITORY = Path(__file__).resolve().parents[3]
@@ -157,8 +159,7 @@ def test_what_is_said_when_it_cannot_be(
     # on the worker, the path leads to another asset
     cluster.add_worker()
     code = (
-        "import sys; from pathlib import Path; import player.app.cluster as c; digest = c._digest\n"
-        "c._digest = lambda folder: 'another'\n"
+        "import sys; from player.asset.asset import Asset; Asset.digest = 'another'\n"
         "from player.app.cli import main; sys.exit(main())"
     )
     done = subprocess.run(
@@ -237,7 +238,7 @@ def test_the_threads_of_a_worker_open_an_asset_once(
         return asset
 
     monkeypatch.setattr(cluster_module.Asset, "open", opening)
-    where = str(asset.folder), cluster_module._digest(asset.folder), asset.n_parts
+    where = str(asset.folder), asset.digest, asset.n_parts
     job = Job(0, orbit(asset_cameras(asset), 1, (16, 12))[0], None, None, "exact", "key", ".png")
     with ThreadPoolExecutor(2) as pool:
         done = [pool.submit(cluster_module._task, job, *where, 1, "numpy", None) for _ in range(2)]
@@ -256,3 +257,20 @@ def test_a_worker_with_an_incomplete_copy_is_refused(tasks: WeakSet[Task], tmp_p
         list(rendered(asset, 1))
     last.write_bytes(content)
     assert [frame.index for frame in rendered(asset, 1)] == [0]
+
+
+def test_a_worker_renders_the_asset_that_the_client_has_opened(
+    tasks: WeakSet[Task], broken_folder: Path
+) -> None:
+    """If another asset takes its place on the disk, a worker goes on with the one that it has opened, and
+    opens no other."""
+    asset = Asset.open(broken_folder)
+    before = [frame.data for frame in rendered(asset, 2)]
+    frames = rendered(asset, 2)
+    first = next(frames)
+    shutil.rmtree(broken_folder)
+    write_shells(broken_folder, sign=-1)
+    assert sorted([first.data, *(frame.data for frame in frames)]) == sorted(before)
+    cluster_module._renderer.cache_clear()
+    with pytest.raises(IntegrityError, match="on a worker: expected the asset of the client, got another"):
+        list(rendered(asset, 1))

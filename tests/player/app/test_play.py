@@ -34,6 +34,7 @@ from player.errors import ConfigError, OutputError
 from player.files.images import png_bytes, read_key, webp_bytes
 from player.march.interpolation import Quality
 from player.render import FRAME_BYTES, Renderer, render
+from tests.player.conftest import write_shells
 from tests.player.in_parts import write_in_parts
 
 REPOSITORY = Path(__file__).resolve().parents[3]
@@ -310,6 +311,19 @@ def test_resume_does_not_mix_an_incomplete_copy_with_the_whole_asset(tmp_path: P
         assert play(first, cameras, again).n_kept == 2
         with pytest.raises(ConfigError, match="--resume: expected a frame of this asset"):
             play(second, cameras, again)
+
+
+def test_frames_are_known_by_the_asset_that_was_opened(broken_folder: Path, tmp_path: Path) -> None:
+    """Frames of an asset that another has replaced on the disk meanwhile are not taken for frames of that."""
+    opened = Asset.open(broken_folder)
+    cameras = [camera.resized(24, 20) for camera in asset_cameras(opened)[:2]]
+    shutil.rmtree(broken_folder)
+    write_shells(broken_folder, sign=-1)
+    settings = PlaySettings(tmp_path / "o", march="numpy")
+    play(opened, cameras, settings)
+    assert play(opened, cameras, replace(settings, resume=True)).n_kept == 2
+    with pytest.raises(ConfigError, match="--resume: expected a frame of this asset"):
+        play(Asset.open(broken_folder), cameras, replace(settings, resume=True))
 
 
 @pytest.mark.parametrize("name", ["frames", pytest.param("turn.mp4", marks=pytest.mark.extra)])
