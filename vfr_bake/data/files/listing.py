@@ -102,8 +102,14 @@ def _order(name: str) -> list[tuple[int, str]]:
 
 def other_kinds(folder: Path) -> str:
     """Return a clause on the files in a folder, and in those within, that are pictures of formats that are
-    not read or videos; empty if there are none."""
-    return named_kinds((path.relative_to(folder) for path in _files(folder)), "name it")
+    not read or videos, and on folders that were made from a video or a ZIP; empty if there are none."""
+    told = named_kinds((path.relative_to(folder) for path in _files(folder)), "name it")
+    if made := sorted(path.name for path in folder.glob("*") if is_made(path)):
+        told += (
+            f"; {printable(made[0])} was made from a video or a ZIP: name it, or copy the pictures of "
+            "several such folders into a new one, in a folder each"
+        )
+    return told
 
 
 def named_kinds(paths: Iterable[PurePath], cure: str) -> str:

@@ -8,9 +8,12 @@ from pathlib import Path
 import pytest
 
 from player.errors import DataError
+from vfr_bake.data import load_scene
+from vfr_bake.data.check.check import check_data
 from vfr_bake.data.files import listing
 from vfr_bake.data.files.listing import find_pictures, other_kinds, unread_cameras
 from vfr_bake.data.files.source import note_source
+from vfr_bake.data.store.working import WorkingSize
 
 
 def touch(folder: Path, *names: str) -> None:
@@ -53,6 +56,22 @@ def test_videos_and_raw_files_are_named_wherever_they_are(tmp_path: Path) -> Non
     )
     assert other_kinds(tmp_path / "masks") == "; there are .dng files: save them as JPEG"
     assert other_kinds(tmp_path / "none") == ""
+
+
+def test_frames_of_several_videos_are_named_where_nothing_else_is_found(tmp_path: Path) -> None:
+    """Frames in a folder of videos are not searched; an error says what to do, and that works."""
+    for stem in ("b", "a"):
+        touch(tmp_path, f"{stem}.mp4", f"{stem}_frames/images/0000.jpg")
+        note_source(tmp_path / f"{stem}_frames", tmp_path / f"{stem}.mp4")
+        (tmp_path / f"{stem}.mp4").unlink()
+    expected = "; a_frames was made from a video or a ZIP: name it, or copy the pictures of several such"
+    for load in (load_scene, lambda data: check_data(data, WorkingSize())):
+        with pytest.raises(DataError, match=f"{expected} folders into a new one, in a folder each$"):
+            load(str(tmp_path))
+    for stem in ("b", "a"):
+        (tmp_path / "both").mkdir(exist_ok=True)
+        (tmp_path / f"{stem}_frames" / "images").rename(tmp_path / "both" / stem)
+    assert names(tmp_path / "both") == ["a/0000.jpg", "b/0000.jpg"]
 
 
 def test_images_come_first(tmp_path: Path) -> None:
