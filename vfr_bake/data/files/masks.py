@@ -21,7 +21,8 @@ from vfr_bake.data.files.orientation import as_stored, read_layout, turned_uprig
 FOLDER = "masks"
 SEEN = 128
 """Level of a mask from which on a pixel counts as seen. Masks that a program has resampled or packed as JPEG
-have greys. If no level is above 1, the mask is of labels, 0 and 1, and 1 is seen."""
+have greys. If no level is above 1, the mask is of labels, 0 and 1, and 1 is seen. What is transparent in a
+mask counts as black."""
 
 
 def mask_of(root: Path, picture: str) -> Path | None:
@@ -112,6 +113,10 @@ def apply_mask(rgba: np.ndarray, picture: Path, mask: Path, upright: bool) -> np
 def _seen(mask: Image.Image) -> np.ndarray:
     """Return which pixels [height, width] of an opened mask count as seen."""
     levels = np.asarray(mask.convert("L"))
+    if mask.mode == "P" and levels.max() < SEEN and np.asarray(mask).max() == 1:
+        levels = np.asarray(mask)  # a palette may give the label 1 a dark colour
+    if mask.has_transparency_data:
+        levels = levels * (np.asarray(mask.convert("RGBA"))[..., 3] / 255)
     return levels >= (1 if levels.max() == 1 else SEEN)
 
 

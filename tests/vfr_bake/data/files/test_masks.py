@@ -172,6 +172,39 @@ def test_a_mask_of_labels(tmp_path: Path) -> None:
         np.testing.assert_array_equal(masked[1:, :, 3] == 255, expected[1:])
 
 
+@pytest.mark.parametrize(
+    ("palette", "seen"),
+    [
+        ([0, 0, 0, 128, 0, 0], 1),  # the colours of labels in Pascal VOC
+        ([0, 0, 0, 255, 255, 255], 1),
+        ([255, 255, 255, 0, 0, 0], 0),  # a program has chosen the order of the two colours
+    ],
+)
+def test_a_mask_with_a_palette(palette: list[int], seen: int, tmp_path: Path) -> None:
+    Image.new("RGB", (40, 30)).save(tmp_path / "a.png")
+    labels = np.zeros((30, 40), np.uint8)
+    labels[:, 20:] = 1
+    mask = Image.fromarray(labels, "P")
+    mask.putpalette(palette)
+    mask.save(tmp_path / "mask.png")
+    rgba = np.full((30, 40, 4), 255, np.uint8)
+    masked = apply_mask(rgba, tmp_path / "a.png", tmp_path / "mask.png", upright=False)
+    np.testing.assert_array_equal(masked[..., 3] == 255, labels == seen)
+
+
+@pytest.mark.parametrize("mode", ["RGBA", "LA"])
+def test_what_is_transparent_in_a_mask_is_masked(mode: str, tmp_path: Path) -> None:
+    Image.new("RGB", (40, 30)).save(tmp_path / "a.png")
+    alpha = np.full((30, 40), 255, np.uint8)
+    alpha[:, :20] = 0
+    mask = Image.new(mode, (40, 30), "white")
+    mask.putalpha(Image.fromarray(alpha))
+    mask.save(tmp_path / "mask.png")
+    rgba = np.full((30, 40, 4), 255, np.uint8)
+    masked = apply_mask(rgba, tmp_path / "a.png", tmp_path / "mask.png", upright=False)
+    np.testing.assert_array_equal(masked[..., 3], alpha)
+
+
 def test_a_mask_of_the_stored_pixels_of_a_turned_picture(tmp_path: Path) -> None:
     exif = Image.Exif()
     exif[0x0112] = 6
