@@ -97,10 +97,11 @@ def exr_channels(
 def exr_header(camera: Camera, places: bool = True) -> dict[str, Any]:
     """Return the attributes of a picture: the meaning of its numbers, and its camera.
 
-    `worldToCamera` and `worldToNDC` are OpenEXR's own, for ROW vectors (p' = p M); the camera's axes are x
-    right, y up, -z ahead. `vfr.cameraToWorld` is the c2w of transforms.json, for column vectors, and
-    `vfr.intrinsics` the 3 x 3 matrix of fx, fy, cx, cy in pixels, pixel centres at +0.5. OpenEXR's own are in
-    float32: without `places` (see `exr_channels`) they are left out.
+    `worldToCamera` and `worldToNDC` are OpenEXR's own, for ROW vectors (p' = p M). OpenEXR's camera space is
+    left-handed: x right, y up, z ahead (ImfStandardAttributes.h). `vfr.cameraToWorld` is the c2w of
+    transforms.json, for column vectors, and `vfr.intrinsics` the 3 x 3 matrix of fx, fy, cx, cy in pixels,
+    pixel centres at +0.5. OpenEXR's own are in float32: without `places` (see `exr_channels`) they are left
+    out.
 
     >>> header = exr_header(Camera("a", np.eye(4), 4, 2, 3.0, 3.0, 2.0, 1.0))
     >>> bool(np.allclose(np.array([0, 0, -5.0, 1]) @ header["worldToNDC"], [2.5, 2.5, 1, 5]))
@@ -116,7 +117,7 @@ def exr_header(camera: Camera, places: bool = True) -> dict[str, Any]:
         ]
     )
     matrices = {
-        "worldToCamera": np.ascontiguousarray(w2c.T, np.float32),
+        "worldToCamera": np.ascontiguousarray((np.diag([1, 1, -1, 1]) @ w2c).T, np.float32),
         "worldToNDC": np.ascontiguousarray((ndc_from_camera @ w2c).T, np.float32),
     }
     return {

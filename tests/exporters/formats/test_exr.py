@@ -91,7 +91,8 @@ def test_what_the_channels_mean(frame: Frame, camera: Camera, opened: Asset) -> 
 
 def test_header_projects_positions_onto_their_pixels(frame: Frame, camera: Camera, tmp_path: Path) -> None:
     """The header's matrices project positions onto their pixels, by OpenEXR's convention: row vectors, and
-    (0, 0) is the upper left corner, (1, 1) the lower right one."""
+    (0, 0) is the upper left corner, (1, 1) the lower right one. Its camera space is left-handed: x right, y
+    up, z ahead."""
     channels = exr_channels(frame, camera)
     path = tmp_path / "a.exr"
     write_exr(path, channels, exr_header(camera))
@@ -104,7 +105,10 @@ def test_header_projects_positions_onto_their_pixels(frame: Frame, camera: Camer
     np.testing.assert_allclose(ndc[:, 0] / ndc[:, 3] * 48, columns + 0.5, rtol=0, atol=1e-3)
     np.testing.assert_allclose(ndc[:, 1] / ndc[:, 3] * 40, rows + 0.5, rtol=0, atol=1e-3)
     local = np.c_[position, np.ones(len(position))] @ header["worldToCamera"]
-    np.testing.assert_allclose(-local[:, 2], channels["Z"][met], rtol=1e-5)
+    np.testing.assert_allclose(local[:, 2], channels["Z"][met], rtol=1e-5)
+    x, y = (local[:, k] / local[:, 2] for k in range(2))
+    np.testing.assert_allclose(camera.cx + camera.fx * x, columns + 0.5, rtol=0, atol=1e-3)
+    np.testing.assert_allclose(camera.cy - camera.fy * y, rows + 0.5, rtol=0, atol=1e-3)
     assert np.array_equal(header["vfr.cameraToWorld"], camera.c2w)
     assert header["vfr.intrinsics"][0].tolist() == [camera.fx, 0, camera.cx]
 
