@@ -2,25 +2,20 @@
 
 A vertex has x y z nx ny nz as float, and red green blue alpha as uchar (sRGB; by these names Blender and
 MeshLab find the colour). A face is a list of three int. The mesh inside an asset has no normals and no alpha,
-which saves 13 of 28 bytes per vertex; readers compute the normals from the faces. `read_ply` reads only these
-two layouts, and accounts for every byte.
+which saves 13 of 28 bytes per vertex; readers compute the normals from the faces. `parse_ply` reads only
+these two layouts, and accounts for every byte.
 """
 
 from __future__ import annotations
 
 import re
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 
 from exporters.shapes.mesh import TriangleMesh, unit_normals
 from player.errors import FormatError, IntegrityError, VfrError
-from player.files.files import read_bytes
 
-MAX_BYTES = 4 << 30
-"""Largest file that `read_ply` reads, in bytes: room for a hundred million faces. The mesh of an asset is
-also compared with the asset's memory budget when the asset is opened."""
 VERTEX = np.dtype([("position", "<f4", 3), ("normal", "<f4", 3), ("colour", "u1", 4)])
 FACE = np.dtype([("n", "u1"), ("corners", "<i4", 3)])
 
@@ -98,19 +93,16 @@ def vertex_rows(mesh: TriangleMesh) -> np.ndarray:
     return rows
 
 
-def read_ply(path: Path) -> TriangleMesh:
-    """Return the mesh in a file that `ply_bytes` or `small_ply_bytes` wrote. If the file has no normals, they
-    are computed from the faces, weighted by area.
+def parse_ply(data: bytes, where: str) -> TriangleMesh:
+    """Return the mesh in the content of a file that `ply_bytes` or `small_ply_bytes` made. If there are no
+    normals in it, they are computed from the faces, weighted by area.
+
+    `where` names the file in an error message.
 
     Raises:
-        FormatError: the file cannot be read, its header is another one, or its content is not a mesh.
-        IntegrityError: the file is shorter or longer than its header says.
+        FormatError: the header is another one, or the content is not a mesh.
+        IntegrityError: the content is shorter or longer than its header says.
     """
-    return parse_ply(read_bytes(path, "a mesh", MAX_BYTES), str(path))
-
-
-def parse_ply(data: bytes, where: str) -> TriangleMesh:
-    """Return the mesh in `data`; `where` names the file in an error message."""
     matches = ((vertex, pattern.match(data)) for vertex, pattern in _PATTERNS)
     vertex, match = next((found for found in matches if found[1]), (VERTEX, None))
     if match is None:

@@ -24,7 +24,6 @@ import numpy as np
 import open3d
 from PIL import Image
 
-from exporters.formats.ply import read_ply
 from exporters.shapes.mesh import TriangleMesh
 from exporters.surface import shaded_colours as surface_colour
 from exporters.surface.asset_surface import AssetSurface, Removed
@@ -34,6 +33,7 @@ from player.cameras.camera import Camera
 from player.cameras.transforms import read_cameras
 from player.progress import silent
 from player.render import Renderer
+from tests.exporters.meshes import read_ply
 
 SHARP = 2
 """Rays of a pixel along each side in pictures of a mesh, because photographs have no jagged edges either."""

@@ -2,9 +2,16 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 
+from exporters.formats.ply import parse_ply
 from exporters.shapes.mesh import TriangleMesh
+
+
+def read_ply(path: Path) -> TriangleMesh:
+    return parse_ply(path.read_bytes(), str(path))
 
 
 def tetrahedron() -> TriangleMesh:

@@ -13,13 +13,13 @@ import pytest
 
 from exporters import cli, export
 from exporters.formats.glb import parse_glb
-from exporters.formats.ply import ply_bytes, read_ply
+from exporters.formats.ply import ply_bytes
 from player.asset.asset import write_asset
 from player.asset.bricks import pack_vertices
 from player.asset.manifest import Manifest
 from player.cameras.camera import Camera
 from player.cameras.transforms import write_cameras
-from tests.exporters.meshes import tetrahedron
+from tests.exporters.meshes import read_ply, tetrahedron
 from tests.vertex_grids import arrays_of
 
 # The asset's mesh is in the world frame already; an exporter that applied this again would be far off.

@@ -16,7 +16,6 @@ import numpy as np
 import pytest
 
 from exporters import cli, export
-from exporters.formats.ply import read_ply
 from exporters.options import ExportOptions, check_options
 from player.app.option_types import part, size
 from player.asset.asset import Asset
@@ -24,6 +23,7 @@ from player.cameras.nerfstudio import write_camera_path
 from player.cameras.transforms import frame_names
 from player.cameras.views import asset_cameras, read_views
 from player.errors import ConfigError, ParityError
+from tests.exporters.meshes import read_ply
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 

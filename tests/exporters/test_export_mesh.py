@@ -16,12 +16,11 @@ import pytest
 import trimesh
 
 from exporters import cli, export, export_mesh
-from exporters.formats.ply import read_ply
 from player.asset.asset import Asset
 from player.errors import OutputError
 from player.files.files import write_together
 from tests.exporters.conftest import CUBE_HIGH, CUBE_LOW
-from tests.exporters.meshes import sphere
+from tests.exporters.meshes import read_ply, sphere
 from tests.exporters.solids import WORLD_FROM_MODEL, offset_of
 from tests.exporters.test_export import fails
 

@@ -28,9 +28,9 @@ import numpy as np
 import torch
 
 from exporters.cli import main as export_main
-from exporters.formats.ply import read_ply
 from player.app.cli import main as play_main
 from player.asset.asset import Asset
+from tests.exporters.meshes import read_ply
 from tests.player.conftest import write_shells
 from vfr_bake.cli import bake_main, train_main
 from vfr_bake.training.model_file import load_model

@@ -18,11 +18,11 @@ import pytest
 from PIL import Image
 
 from exporters import cli
-from exporters.formats.ply import read_ply
 from exporters.formats.vdb import parse_vdb
 from exporters.shapes.colour import linear_from_srgb, srgb_from_linear
 from player.app.cli import main as play
 from tests.exporters.formats import block
+from tests.exporters.meshes import read_ply
 
 pytestmark = pytest.mark.needs("programs")
 LOOK = Path(__file__).with_name("blender_look.py")

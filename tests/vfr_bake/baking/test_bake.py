@@ -14,7 +14,6 @@ import onnxruntime
 import pytest
 import torch
 
-from exporters.formats.ply import read_ply
 from exporters.head.onnx_head import head_onnx
 from player.asset.asset import Asset
 from player.asset.bricks import pack_vertices
@@ -23,6 +22,7 @@ from player.errors import ConfigError, OutputError, TrainingError
 from player.march.fetches import MIN_TOTAL
 from player.march.march import march
 from player.render import render
+from tests.exporters.meshes import read_ply
 from tests.numerics.fog import fog
 from tests.vertex_grids import rows_of
 from tests.vfr_bake.data.solids import AABB, signed_distance

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from exporters.formats.ply import read_ply
 from player.asset.asset import Asset
 from player.cameras.camera import Camera
 from player.cameras.transforms import write_cameras
@@ -19,6 +18,7 @@ from player.errors import ConfigError, TrainingError
 from player.kept_code import is_kept
 from player.page.gpu_memory import TILE, gpu_bytes
 from player.progress import silent
+from tests.exporters.meshes import read_ply
 from vfr_bake.baking import mesh as baked_mesh
 from vfr_bake.baking.bake import _Bake, bake
 from vfr_bake.baking.cells import FLOORS

@@ -10,13 +10,13 @@ import pytest
 import torch
 
 from exporters.export import export_asset
-from exporters.formats.ply import read_ply
 from player.asset.asset import Asset
 from player.cameras.camera import Camera
 from player.compiled import march as march_compiled
 from player.march.contracted import enter_space
 from player.progress import silent
 from player.render import render
+from tests.exporters.meshes import read_ply
 from tests.reference import contract
 from tests.vfr_bake.baking.scenes import trained
 from vfr_bake.baking.bake import _Bake, bake
