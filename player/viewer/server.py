@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import errno
-import io
 import os
 import socket
+import sys
 import threading
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager, redirect_stdout
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -111,9 +111,9 @@ def serve(
         from player.proof import prove
 
         prove(say)
-    with ExitStack() as stack, warnings.catch_warnings():
-        # viser's warning when a client leaves while something is sent to it
-        warnings.filterwarnings("ignore", "Queued a .* on a closed connection")
+    # viser's warning when a client leaves while something is sent to it
+    warnings.filterwarnings("ignore", "Queued a .* on a closed connection")
+    with ExitStack() as stack:
         renderers = [
             stack.enter_context(Renderer(first, settings.threads, settings.march)) for first in firsts
         ]
@@ -142,7 +142,7 @@ def serve(
             for window in list(windows.values()):
                 window.close()
             pages.close()
-            with redirect_stdout(io.StringIO()):
+            with _viser_silenced():
                 server.stop()
 
 
@@ -166,17 +166,32 @@ def guarded_server(host: str, port: int, title: str = "", pages: Pages = NO_PAGE
 
     server = None
     try:
-        # without its banner: scripts read the one line that vfr-play prints
-        with (
-            every_connection_checked(Guard(host, viser.__version__, pages)),
-            redirect_stdout(io.StringIO()),
-        ):
+        with every_connection_checked(Guard(host, viser.__version__, pages)), _viser_silenced():
             server = viser.ViserServer(host=host, port=port, label=title, verbose=False)
     except MissingExtraError:
         if server is not None:
             server.stop()
         raise
     return server
+
+
+@contextmanager
+def _viser_silenced() -> Iterator[None]:
+    """Drop what viser prints while a `with` block runs: it has no setting for that, and scripts read the one
+    line that vfr-play prints. All else that the program prints, on any thread, is printed."""
+    import rich
+
+    original = rich.print
+
+    def of_others(*args: Any, **kwargs: Any) -> None:
+        if not sys._getframe(1).f_globals["__name__"].startswith("viser."):
+            original(*args, **kwargs)
+
+    rich.print = of_others
+    try:
+        yield
+    finally:
+        rich.print = original
 
 
 def _page(folder: Path, settings: ServeSettings) -> bytes:

@@ -5,13 +5,16 @@ from __future__ import annotations
 import math
 import socket
 import struct
+import sys
 import time
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import msgspec
 import pytest
+import rich
 import viser
 from websockets.datastructures import Headers
 from websockets.exceptions import ConnectionClosed, InvalidStatus
@@ -132,6 +135,27 @@ def test_a_viser_that_cannot_be_guarded_serves_nothing(monkeypatch: pytest.Monke
         patched.setattr(guard, "CAMERA_FIELDS", (*messages.CAMERA_FIELDS, "roll"))
         with pytest.raises(MissingExtraError, match=r"pip install viser==1\.1\.1"):
             guarded_server("127.0.0.1", port)
+
+
+def test_the_output_and_the_warnings_of_a_program_stay_its_own(
+    asset: Asset, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """What the program prints while viser starts or stops is printed, as another thread may print then."""
+
+    class Printing(viser.ViserServer):
+        def __init__(self, **options: Any) -> None:
+            super().__init__(**options)
+            sys.stdout.write("started, ")
+
+        def stop(self) -> None:
+            super().stop()
+            rich.print("stopped")
+
+    monkeypatch.setattr("viser.ViserServer", Printing)
+    with serve(asset, ServeSettings(march="numpy")):
+        warnings.filterwarnings("ignore", "of the program")
+    assert capfd.readouterr() == ("started, stopped\n", "")
+    assert any(message and message.match("of the program") for _, message, *_ in warnings.filters)
 
 
 def test_a_client_cannot_open_a_way_in_from_the_internet(server: Server) -> None:
