@@ -109,3 +109,8 @@ def contract(point: np.ndarray) -> np.ndarray:
     """Contract a point [3] by equation 10 of mip-NeRF 360; it must be finite."""
     norm = np.linalg.norm(point)
     return point if norm <= 1 else (2 - 1 / norm) * point / norm
+
+
+def srgb_from_linear(linear: np.ndarray) -> np.ndarray:
+    """Convert linear light in [0, 1] to sRGB values in [0, 1], by IEC 61966-2-1."""
+    return np.where(linear <= 0.0031308, linear * 12.92, 1.055 * np.maximum(linear, 0) ** (1 / 2.4) - 0.055)

@@ -1,6 +1,6 @@
-"""Colours: conversion between sRGB and linear light, and colours that are known for some points only.
+"""Colours: conversion from sRGB to linear light, and colours that are known for some points only.
 
-The two curves are those of IEC 61966-2-1, joined at 0.04045 (sRGB) and 0.0031308 (linear). Pictures, PLY and
+The curve is that of IEC 61966-2-1, whose two pieces meet at 0.04045. Pictures, PLY and
 OBJ hold sRGB; glTF vertex colours (COLOR_0) and EXR hold linear light.
 """
 
@@ -29,13 +29,3 @@ def linear_from_srgb(srgb: ArrayLike) -> np.ndarray:
     """
     value = np.asarray(srgb, np.float64)
     return np.where(value <= 0.04045, value / 12.92, ((np.maximum(value, 0) + 0.055) / 1.055) ** 2.4)
-
-
-def srgb_from_linear(linear: ArrayLike) -> np.ndarray:
-    """Convert linear light in [0, 1] to sRGB values in [0, 1]: the inverse of `linear_from_srgb`.
-
-    >>> srgb_from_linear([0.0, 0.21586, 1.0]).round(4).tolist()
-    [0.0, 0.502, 1.0]
-    """
-    value = np.asarray(linear, np.float64)
-    return np.where(value <= 0.0031308, value * 12.92, 1.055 * np.maximum(value, 0) ** (1 / 2.4) - 0.055)

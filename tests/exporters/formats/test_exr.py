@@ -14,13 +14,13 @@ import pytest
 
 from exporters import cli
 from exporters.formats.exr import check_channels, exr_channels, exr_header, write_exr
-from exporters.shapes.colour import srgb_from_linear
 from player.asset.asset import Asset
 from player.cameras.camera import Camera
 from player.cameras.transforms import read_cameras
 from player.errors import MissingExtraError, OutputError, ParityError, ShapeError
 from player.march.march import MIN_OPACITY
 from player.render import Frame, Renderer
+from tests.reference import srgb_from_linear
 
 SRGB_TO_XYZ = [[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]]
 """The matrix from linear sRGB to XYZ, as IEC 61966-2-1 has it, to four digits."""

@@ -19,10 +19,11 @@ from PIL import Image
 
 from exporters import cli
 from exporters.formats.vdb import parse_vdb
-from exporters.shapes.colour import linear_from_srgb, srgb_from_linear
+from exporters.shapes.colour import linear_from_srgb
 from player.app.cli import main as play
 from tests.exporters.formats import block
 from tests.exporters.meshes import read_ply
+from tests.reference import srgb_from_linear
 
 pytestmark = pytest.mark.needs("programs")
 LOOK = Path(__file__).with_name("blender_look.py")
