@@ -58,7 +58,7 @@ class Target:
         >>> Target.of(PlaySettings(Path("out"), format="webp")).suffix
         '.webp'
         """
-        path = settings.output
+        path = Path(settings.output)
         suffix = path.suffix.lower()
         if suffix == VIDEO:
             return cls(path, path.with_name(f"{path.name}.frames"), ".png")

@@ -77,7 +77,7 @@ class PlaySettings:
     player.errors.ConfigError: --background: a video has no transparency
     """
 
-    output: Path
+    output: str | Path
     """A folder of pictures, one picture (.png, .webp), or a video (.mp4)."""
     format: Literal["png", "webp"] | None = None
     """Format of the pictures in a folder; PNG if None."""
@@ -115,16 +115,17 @@ class PlaySettings:
         check_choice("quality", self.quality, get_args(Quality))
         if self.format is not None:
             check_choice("format", self.format, ("png", "webp"))
-        suffix = self.output.suffix.lower()
+        output = Path(self.output)
+        suffix = output.suffix.lower()
         if self.resume and self.force:
             raise ConfigError("--resume: not allowed with --force, which renders everything anew")
         if suffix in NOT_WRITTEN:
             raise ConfigError(
                 f"--output: expected a folder, a picture ({', '.join(PICTURES)}) or a video ({VIDEO}), "
-                f"got {self.output.name}"
+                f"got {output.name}"
             )
         if self.format is not None and suffix in (*PICTURES, VIDEO):
-            raise ConfigError(f"--format: {self.output.name} says which format it is")
+            raise ConfigError(f"--format: {output.name} says which format it is")
         if self.background == "transparent" and suffix == VIDEO:
             raise ConfigError("--background: a video has no transparency")
 

@@ -97,7 +97,7 @@ def test_a_program_plays_as_the_command_does(
     assert [numbers[:2] for numbers in shown] == [(1, 2), (2, 2)] and played.n_kept == 0
     with pytest.raises(OutputError, match="not empty: add --force"):
         play(asset, asset_cameras(asset), settings)
-    played = play(asset, asset_cameras(asset), replace(settings, resume=True))
+    played = play(asset, asset_cameras(asset), replace(settings, output=f"{here}/", resume=True))
     assert (played.n_kept, played.figures["frames"]) == (2, 0)
 
 
@@ -119,8 +119,9 @@ def test_a_program_plays_as_the_command_does(
     ],
 )
 def test_settings_that_cannot_be(output: str, settings: dict[str, Any], message: str) -> None:
-    with pytest.raises(ConfigError, match=message):
-        PlaySettings(Path(output), **settings)
+    for named in (Path(output), output):
+        with pytest.raises(ConfigError, match=message):
+            PlaySettings(named, **settings)
 
 
 @pytest.mark.parametrize("name", ["frames", pytest.param("turn.mp4", marks=pytest.mark.extra)])
