@@ -9,12 +9,17 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
+from datetime import timedelta
 from typing import TypeVar
 
 import torch
 from torch import Tensor, distributed
 
 T = TypeVar("T")
+
+PATIENCE = timedelta(days=30)
+"""How long a process waits for the others. gloo's own half an hour would end them while the first one
+estimates the cameras of many photographs, or renders test views; torchrun ends them if one fails."""
 
 
 class Processes:
@@ -32,7 +37,7 @@ class Processes:
         """Join the process group that the environment variables RANK and WORLD_SIZE describe."""
         size = int(os.environ.get("WORLD_SIZE", "1"))
         if size > 1 and not distributed.is_initialized():
-            distributed.init_process_group("gloo")
+            distributed.init_process_group("gloo", timeout=PATIENCE)
         return cls(int(os.environ.get("RANK", "0")) if size > 1 else 0, size)
 
     @property

@@ -5,11 +5,15 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from datetime import timedelta
+from typing import Any
 
 import numpy as np
 import pytest
+from torch import distributed
 
 from tests.cores import every_core
+from vfr_bake.training.processes import Processes
 
 PROGRAM = """
 import json, sys
@@ -71,3 +75,13 @@ def test_two_processes_have_the_loss_curve_of_one(kind: str, curves: list[dict[s
     # Backgrounds are random, so that a step's loss says little: over 40 steps it hides the progress.
     for curve in losses:
         assert np.mean(curve[60:]) < np.mean(curve[:20])
+
+
+def test_a_process_waits_as_long_as_the_first_one_needs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Estimating cameras, or rendering many test views, takes the first process hours."""
+    given: dict[str, Any] = {}
+    monkeypatch.setattr(distributed, "init_process_group", lambda *_, **settings: given.update(settings))
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    monkeypatch.setenv("RANK", "1")
+    assert not Processes.from_environment().first
+    assert given["timeout"] > timedelta(days=1)
