@@ -104,6 +104,8 @@ class Capture:
     masked: bool = False
     """Whether pixels that are not opaque are masked, so that nothing is known of what is there. Otherwise
     they say that nothing is there."""
+    transparent: bool = False
+    """Whether pictures that have masks have transparent surroundings, too. Both are transparent pixels."""
 
 
 def held_out(views: PosedImages) -> tuple[PosedImages, PosedImages]:

@@ -21,15 +21,18 @@ from vfr_bake.data.capture import Capture, PosedImages, held_out
 from vfr_bake.data.files.estimate_record import read_record
 from vfr_bake.data.files.listing import find_pictures, other_kinds
 from vfr_bake.data.files.masks import mask_of, stray_masks
-from vfr_bake.data.files.opening import SUFFIXES
+from vfr_bake.data.files.opening import SUFFIXES, open_photograph
 from vfr_bake.data.files.orientation import PictureHeader, is_taken_upright, read_layout
-from vfr_bake.data.files.pictures import DescribedView
+from vfr_bake.data.files.pictures import DescribedView, read_picture
 from vfr_bake.data.store.reading import PictureReader
 
 DISTORTION_KEYS = ("k1", "k2", "k3", "k4", "p1", "p2")
 SAME = 1e-4
 """Largest difference between numbers of cameras that count as the same, in the units of the file: they may
 have been rounded to different digits."""
+
+N_LOOKED_AT = 8
+"""Number of pictures with masks, at least, of which it is seen whether they are transparent by themselves."""
 
 
 def load_folder(
@@ -129,7 +132,24 @@ def _capture(
 ) -> Capture:
     masked = any(view.mask is not None for view in described)
     name = folder.resolve().name or "scene"
-    return Capture(name, train, test, points, masked)
+    return Capture(name, train, test, points, masked, masked and _mostly_transparent(described))
+
+
+def _mostly_transparent(described: Sequence[DescribedView]) -> bool:
+    """Return whether at least half of some pictures, spread evenly, are transparent somewhere, whatever is
+    masked. Raises DataError."""
+    some = described[:: max(1, len(described) // N_LOOKED_AT)]
+    return 2 * sum(_is_transparent(view.path) for view in some) >= len(some)
+
+
+def _is_transparent(picture: Path) -> bool:
+    try:
+        with open_photograph(picture) as file:
+            if not file.has_transparency_data:
+                return False
+    except FormatError as error:
+        raise DataError(str(error)) from error
+    return bool((read_picture(picture)[..., 3] < 255).any())
 
 
 def has_transforms(folder: Path) -> bool:

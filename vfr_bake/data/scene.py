@@ -69,7 +69,8 @@ def build_scene(capture: Capture, kind: SceneKind = "auto") -> Scene:
     model frame, which the training views alone decide.
 
     Raises DataError if depth cannot be found (fewer than two training views, or all from one place), if
-    nearly everything is masked, or if all pictures are transparent.
+    nearly everything is masked, if all pictures are transparent, or if pictures of an object with transparent
+    surroundings have masks.
 
     >>> from vfr_bake.data.demo import demo_capture
     >>> scene = build_scene(demo_capture(size=16, n_train=4, n_test=1))
@@ -78,6 +79,11 @@ def build_scene(capture: Capture, kind: SceneKind = "auto") -> Scene:
     """
     train, test = capture.train, capture.test
     _check_cameras(capture.name, train.cameras)
+    if capture.transparent and kind != "unbounded":
+        raise DataError(
+            f"{capture.name}: training views: expected transparent surroundings or masks, got both: remove "
+            "the masks to train an object, or pass --kind unbounded, which masks what is transparent, too"
+        )
     n_views = len(train.cameras)
     n_transparent = 0 if capture.masked else sum(not train.opaque(number) for number in range(n_views))
     has_alpha = n_transparent > 0

@@ -98,6 +98,23 @@ def test_a_hole_in_one_picture_is_masked_and_told_of(tmp_path: Path) -> None:
     assert load_scene_as({}, False, folder).has_alpha and load_scene_as({}, True, folder).masked
 
 
+@pytest.mark.parametrize("n_masks", [24, 1])
+def test_masks_of_an_object_with_transparent_surroundings_are_refused(n_masks: int, tmp_path: Path) -> None:
+    """A transparent pixel is either masked or one where nothing is, and a mask in one picture would make it
+    masked in all."""
+    folder = masked_folder(tmp_path)
+    for number, view in enumerate(demo_views(32, 24, 1)[0].images):
+        Image.fromarray(view).save(folder / "images" / f"{number:02d}.png")
+    for mask in sorted((folder / "masks").iterdir())[n_masks:]:
+        mask.unlink()
+    for kind in ("auto", "object"):
+        with pytest.raises(DataError, match="expected transparent surroundings or masks, got both"):
+            load_scene(folder, kind=kind)
+    assert load_scene(folder, kind="unbounded").masked
+    shutil.rmtree(folder / "masks")
+    assert load_scene(folder).has_alpha
+
+
 def test_everything_masked(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"masks: expected some of the pictures to be seen, got 0 of"):
         load_scene(masked_folder(tmp_path, 1.0))
