@@ -181,13 +181,12 @@ export class Renderer {
   }
 
   // Return the feature lookups per ray and the base steps per sample of a view's quality. Lookups are limited as the bake
-  // found, or not at all where it found 0, which means that fewer lookups lose too much. In older assets, where it did not
-  // look for limits, measured losses against photographs, for lego and fox, are 0.02 and 0.00 dB for `high`, and 0.19 and
-  // 0.05 dB for `fast`. Samples twice as long would cost lego, whose base steps are three cells long, 2.9 dB; so `fast` has
-  // them only if a base step is at most one cell long, and not if the bake found that nothing may be left out.
+  // found. They are not limited where it found 0, which means that fewer lookups lose too much, nor in older assets, where
+  // it did not look for limits. Samples twice as long would cost lego, whose base steps are three cells long, 2.9 dB; so
+  // `fast` has them only if a base step is at most one cell long, and not if the bake found that nothing may be left out.
   quality(view) {
     const { manifest } = this.scene, { n_fetches: k, level_steps: steps } = manifest;
-    const [high, fast] = manifest.quality_fetches ?? [Math.ceil((7 * k) / 8), Math.ceil(k / 2)];
+    const [high, fast] = manifest.quality_fetches ?? [0, 0];
     const most = { exact: 0, high, fast }[view.quality ?? "high"];
     const fetches = Math.min(most || k, k || most); // 0 is no limit in both
     const cells = Math.max(...this.constant.uCellsPerUnit) * manifest.step;

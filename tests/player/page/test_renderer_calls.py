@@ -416,14 +416,14 @@ QUALITIES = """([changes, finest]) => {
         (12, [0, 0], [12, 12, 12]),
         (12, [16, 13], [12, 12, 12]),
         (0, [8, 0], [0, 8, 0]),
-        (12, None, [12, 11, 6]),
+        (12, None, [12, 12, 12]),
     ],
 )
 def test_qualities_keep_to_the_lookups_that_the_bake_found(
     page: RenderPage, n_fetches: int, limits: list[int] | None, lookups: list[int]
 ) -> None:
     """The manifest's `quality_fetches` limit the lookups, and 0 is no limit; without them, as in assets of
-    earlier versions, the page has limits of its own."""
+    earlier versions, there is none either."""
     changes = {"n_fetches": n_fetches} | ({} if limits is None else {"quality_fetches": limits})
     found = page.page.evaluate(QUALITIES, [changes, False])
     assert [lookups for lookups, _ in found] == lookups
