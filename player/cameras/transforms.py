@@ -70,8 +70,8 @@ def read_cameras(path: str | Path, size: tuple[int, int] | None = None) -> list[
 
     The focal length is `fl_x`, `fl_y` in pixels, or else follows from `camera_angle_x`, `camera_angle_y`, the
     whole field of view in radians. A key inside a frame takes precedence over the same key at the top. A
-    matrix of three rows is completed. Lens distortion (`k1`, ...) is not part of a camera: the cameras
-    returned are pinholes.
+    matrix of three rows is completed. Lens distortion (`k1`, ...) is not part of a camera: pictures are
+    undistorted when they are read, and the cameras returned are those of the undistorted pictures.
 
     Raises FormatError in one line: file, frame, expected, got.
 

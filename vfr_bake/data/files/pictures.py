@@ -234,46 +234,28 @@ def undistort(
     k4: float = 0.0,
     p1: float = 0.0,
     p2: float = 0.0,
-) -> tuple[Camera, np.ndarray]:
-    """Return a picture of the same size without lens distortion, and the pinhole camera that would have taken
-    it.
+) -> np.ndarray:
+    """Return the picture that `camera` would have taken without lens distortion; same size, same intrinsics.
 
     The lens model is OpenCV's with nerfstudio's fourth radial term: with r² = x² + y² at x, y = ray / depth,
     x' = x (1 + k1 r² + k2 r⁴ + k3 r⁶ + k4 r⁸) + 2 p1 x y + p2 (r² + 2 x²), and y' likewise with x, y and p1,
-    p2 exchanged. (`cv2.undistort` has no k4 of this meaning.) The camera is `camera` itself if the lens saw
-    all that this shows. Otherwise it shows a rectangle of that which the lens did see.
+    p2 exchanged. (`cv2.undistort` has no k4 of this meaning.) Pixels that the lens never saw repeat the
+    picture's edge.
 
     `image`: [height, width, 4] uint8. Raises MissingExtraError without OpenCV.
     """
     cv2 = opencv(f"{camera.name}: lens distortion: expected OpenCV to undo it", "train")
-    size = width, height = camera.width, camera.height
-    x = (np.arange(width) + 0.5 - camera.cx)[None, :] / camera.fx
-    y = (np.arange(height) + 0.5 - camera.cy)[:, None] / camera.fy
+    x = (np.arange(camera.width) + 0.5 - camera.cx)[None, :] / camera.fx
+    y = (np.arange(camera.height) + 0.5 - camera.cy)[:, None] / camera.fy
     r2 = x * x + y * y
     radial = 1 + r2 * (k1 + r2 * (k2 + r2 * (k3 + r2 * k4)))
-    column = camera.fx * (x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)) + camera.cx
-    row = camera.fy * (y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y) + camera.cy
-    top, bottom, left, right = _filled((column >= 0) & (column <= width) & (row >= 0) & (row <= height))
-    part = replace(camera, width=right - left, height=bottom - top, cx=camera.cx - left, cy=camera.cy - top)
-    places = [
-        cv2.resize((place - 0.5).clip(-1e6, 1e6).astype(np.float32)[top:bottom, left:right], size)
-        for place in (column, row)
-    ]
-    result = cv2.remap(premultiplied(image), *places, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return part.resized(*size), straight(result)
-
-
-def _filled(seen: np.ndarray) -> tuple[int, int, int, int]:
-    """Return the rows and columns (top, bottom, left, right) of a large rectangle of `seen` [height, width]
-    whose edges are true, and which is not empty. The edge with the largest share that is not true is cut off,
-    again and again."""
-    top, left, (bottom, right) = 0, 0, seen.shape
-    while min(bottom - top, right - left) > 1:
-        part = seen[top:bottom, left:right]
-        shares = [edge.mean() for edge in (part[0], part[-1], part[:, 0], part[:, -1])]
-        worst = int(np.argmin(shares))
-        if shares[worst] == 1:
-            break
-        top, bottom = top + (worst == 0), bottom - (worst == 1)
-        left, right = left + (worst == 2), right - (worst == 3)
-    return top, bottom, left, right
+    column = camera.fx * (x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)) + camera.cx - 0.5
+    row = camera.fy * (y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y) + camera.cy - 0.5
+    result = cv2.remap(
+        premultiplied(image),
+        column.clip(-1e6, 1e6).astype(np.float32),
+        row.clip(-1e6, 1e6).astype(np.float32),
+        cv2.INTER_LINEAR,
+        borderMode=cv2.BORDER_REPLICATE,
+    )
+    return straight(result)

@@ -82,7 +82,7 @@ class WorkingSize:
         bent = any(view.distortion.values())
         if self.downscale is not None or self.max_side is None:
             if bent:
-                camera, image = undistort(image, camera, **view.distortion)
+                image = undistort(image, camera, **view.distortion)
             views = reduced(PosedImages([camera], [image]), self.downscale or 1)
             return views.cameras[0], views.images[0]
         if bent:
@@ -90,7 +90,7 @@ class WorkingSize:
             # interpolation blurs nothing that is kept.
             step = self._whole_step(max(image.shape[:2]))
             camera, image = resized(camera, image, -(-image.shape[1] // step), -(-image.shape[0] // step))
-            camera, image = undistort(image, camera, **view.distortion)
+            image = undistort(image, camera, **view.distortion)
         return resized(camera, image, *target)
 
     def of(self, views: PosedImages) -> PosedImages:
