@@ -43,6 +43,7 @@ export class Controls {
     on(canvas, "pointermove", this.drag);
     for (const type of ["pointerup", "pointercancel"]) on(canvas, type, this.up);
     on(canvas, "wheel", this.wheel, { passive: false });
+    for (const type of ["gesturestart", "gesturechange"]) on(canvas, type, this.pinch);
     on(canvas, "mousedown", (event) => event.button === 1 && event.preventDefault()); // the middle button would scroll
     on(canvas, "contextmenu", (event) => event.preventDefault());
     on(window, "keydown", this.keyDown);
@@ -106,6 +107,15 @@ export class Controls {
     this.near(Math.exp(Math.min(Math.max(pixels, -400), 400) * 0.0012));
   }
 
+  // Follow a pinch on a touch pad in Safari on macOS, whose events have the scale since the pinch began.
+  pinch(event) {
+    if (!this.engaged || this.pointers.size) return; // fingers on a screen are followed by their pointers
+    event.preventDefault();
+    const before = event.type === "gesturestart" ? 1 : this.scale;
+    this.scale = event.scale;
+    this.near(before / event.scale);
+  }
+
   // --- how gestures and keys move the camera ---
 
   turn(dx, dy) {
@@ -137,9 +147,9 @@ export class Controls {
     this.viewer.wake();
   }
 
-  keyUp(event) {
-    this.held.delete(event.code);
-    for (const name of ["+", "=", "-"]) this.held.delete(name);
+  keyUp({ code, key }) {
+    if (key === "Meta") this.held.clear(); // macOS does not tell of keys that are let go while Cmd is held
+    for (const name of [code, key, "+", "=", "-"]) this.held.delete(name);
   }
 
   // Move as the held keys say, for so many seconds; return whether any key is held.

@@ -6,6 +6,13 @@ import { Views } from "./views.js";
 const LAYERS = ["colour", "depth", "normals", "opacity"];
 const element = (id) => document.getElementById(id);
 
+// Return what a key is called in `keys` below. On a keyboard of another script, it is the Latin letter or the bracket of
+// the key at the same place.
+function nameOf({ key, code }) {
+  const name = key < "\x7f" ? key : { BracketLeft: "[", BracketRight: "]" }[code] ?? code.replace("Key", "");
+  return name.length > 1 ? name : name.toLowerCase();
+}
+
 export class Panel {
   // Set up what is shown before there is a scene.
   constructor() {
@@ -77,7 +84,7 @@ export class Panel {
     viewer.onturn = (on) => press("turn", on);
     press("turn", viewer.turning);
     window.addEventListener("keydown", (event) => {
-      const action = keys[event.key.length > 1 ? event.key : event.key.toLowerCase()];
+      const action = keys[nameOf(event)];
       const taken = event.target.closest?.(`select, input, dialog[open]${event.key === " " ? ", button" : ""}`);
       const bracket = event.altKey && "[]".includes(event.key); // a bracket typed with AltGr or Option
       if (!action || taken || event.repeat || event.metaKey) return;

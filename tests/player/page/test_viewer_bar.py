@@ -160,6 +160,22 @@ def test_brackets_of_keyboards_that_have_them_behind_other_keys(chromium: Browse
             assert matches(still(page), VIEWS[view])
 
 
+def test_keys_of_keyboards_of_another_script(chromium: Browser) -> None:
+    """A key of another script does what the Latin letter or the bracket at its place does."""
+    with opened(chromium, FILES, "#view=0&turn=off", reduced_motion="reduce") as (page, *_):
+        for key, code in (("п", "KeyG"), ("ъ", "BracketRight"), ("ъ", "BracketRight"), ("х", "BracketLeft")):
+            page.evaluate(
+                """([key, code]) => {
+                  document.body.dispatchEvent(new KeyboardEvent("keydown", { key, code, bubbles: true }));
+                }""",
+                [key, code],
+            )
+        assert page.locator("#fly").get_attribute("aria-pressed") == "true"
+        assert page.locator("#views").evaluate("e => e.selectedIndex") == 2
+        page.keyboard.press("G")
+        assert page.locator("#fly").get_attribute("aria-pressed") == "false"
+
+
 def turns(page: Page) -> bool:
     before = page.evaluate("() => drawn.at(-1)")
     page.wait_for_timeout(400)

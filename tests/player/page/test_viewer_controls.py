@@ -62,6 +62,27 @@ def test_the_wheel_goes_nearer(chromium: Browser) -> None:
         assert distance(still(page)) == pytest.approx(distance(before))
 
 
+def test_a_pinch_on_a_touch_pad_in_safari_goes_nearer(chromium: Browser) -> None:
+    """Safari on macOS tells of it by events of its own; on a screen, where fingers are pointers, too."""
+    pinch = """(scales) => scales.forEach((scale, i) => {
+      const event = new Event(i ? "gesturechange" : "gesturestart", { cancelable: true });
+      canvas.dispatchEvent(Object.assign(event, { scale }));
+      (globalThis.prevented ??= []).push(event.defaultPrevented);
+    })"""
+    with opened(chromium, FILES, "#turn=off") as (page, *_):
+        before = still(page)
+        page.evaluate(pinch, [1, 1.25, 2])
+        assert distance(near := still(page)) == pytest.approx(distance(before) / 2)
+        page.evaluate(pinch, [1, 0.8])
+        assert distance(away := still(page)) == pytest.approx(distance(near) / 0.8)
+        assert page.evaluate("() => prevented") == [True] * 5, "Safari does not zoom the page"
+        page.mouse.move(300, 200)
+        page.mouse.down()
+        page.evaluate(pinch, [1, 2])
+        page.mouse.up()
+        assert distance(still(page)) == pytest.approx(distance(away))
+
+
 def hit_at(view: dict[str, Any], x: float, y: float) -> np.ndarray:
     """Return the point [3] at a pixel of a view, 3 units away, as the stub renderer of these tests has it."""
     ray = c2w(view)[:3, :3] @ [(x - view["cx"]) / view["fx"], (view["cy"] - y) / view["fy"], -1]
@@ -242,6 +263,28 @@ def test_a_held_key_moves_until_it_is_let_go(chromium: Browser) -> None:
         n = page.evaluate("() => drawn.length")
         page.wait_for_timeout(300)
         assert page.evaluate("() => drawn.length") == n
+
+
+@pytest.mark.parametrize(
+    ("held", "let_go"),
+    [({"key": "ArrowLeft"}, {"key": "ArrowLeft"}), ({"key": "w", "code": "KeyW"}, {"key": "Meta"})],
+    ids=["no code", "let go while Cmd is held"],
+)
+def test_a_key_that_is_let_go_otherwise(
+    chromium: Browser, held: dict[str, str], let_go: dict[str, str]
+) -> None:
+    """Some devices send keys without a code; macOS does not tell of a key that is let go while Cmd is held,
+    only of Cmd itself."""
+    send = "([type, key]) => { dispatchEvent(new KeyboardEvent(type, key)); }"
+    with opened(chromium, FILES, "#turn=off") as (page, *_):
+        before = still(page)
+        page.evaluate(send, ["keydown", held])
+        page.evaluate(send, ["keyup", let_go])
+        after = still(page)
+        assert not np.allclose(c2w(after), c2w(before))
+        n = page.evaluate("() => drawn.length")
+        page.wait_for_timeout(300)
+        assert page.evaluate("() => drawn.length") == n, "it stands still"
 
 
 def test_everything_works_by_keyboard_alone(chromium: Browser) -> None:
