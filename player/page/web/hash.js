@@ -1,6 +1,6 @@
 // Reads the options in the address of the page: #view=12&quality=exact&noui&turn&background=white
 
-const COLOURS = { white: [1, 1, 1], black: [0, 0, 0], transparent: "transparent" };
+const COLOURS = new Map([["white", [1, 1, 1]], ["black", [0, 0, 0]], ["transparent", "transparent"]]);
 
 // Return the options in the text behind `#`. An option that is not there, or cannot be read, is undefined.
 //
@@ -17,7 +17,7 @@ export function optionsOf(hash) {
   options.noui = switched("noui");
   options.turn = switched("turn");
   const levels = (background ?? "").split(",").map((text) => (/^\d{1,3}$/.test(text) ? Number(text) / 255 : 2));
-  if (Object.hasOwn(COLOURS, background ?? "")) options.background = COLOURS[background];
+  if (COLOURS.has(background)) options.background = COLOURS.get(background);
   else if (levels.length === 3 && levels.every((level) => level <= 1)) options.background = levels;
   return options;
 }

@@ -30,9 +30,9 @@ async function show() {
     viewer?.flyToView(options.view);
     viewer?.follow(options);
   };
-  follow();
-  addEventListener("hashchange", follow);
   try {
+    follow();
+    addEventListener("hashchange", follow);
     for await (const scene of loadScene(({ done, total }) => panel.progress(done / total))) {
       problem = scene.problem;
       advice = INSTEAD;

@@ -176,6 +176,20 @@ def test_keys_of_keyboards_of_another_script(chromium: Browser) -> None:
         assert page.locator("#fly").get_attribute("aria-pressed") == "false"
 
 
+def test_options_without_a_method_that_older_browsers_lack(chromium: Browser) -> None:
+    files = {**FILES, "hash.js": b"delete Object.hasOwn;\n" + FILES["hash.js"]}
+    for name, colour in (("black", [0, 0, 0]), ("255,0,0", [1, 0, 0]), ("toString", [1, 1, 1])):
+        with opened(chromium, files, f"#background={name}") as (page, *_):
+            assert page.evaluate("() => drawn.at(-1).background") == colour
+
+
+def test_options_that_cannot_be_followed_are_told(chromium: Browser) -> None:
+    files = {**FILES, "hash.js": b"export const optionsOf = () => { throw new Error('no options'); };"}
+    with opened(chromium, files, wait=False) as (page, *_):
+        page.wait_for_selector("body.failed")
+        assert "cannot be shown here: no options" in page.inner_text("#status")
+
+
 def turns(page: Page) -> bool:
     before = page.evaluate("() => drawn.at(-1)")
     page.wait_for_timeout(400)
