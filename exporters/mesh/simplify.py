@@ -47,8 +47,10 @@ def simplify_mesh(mesh: TriangleMesh, n_faces: int) -> TriangleMesh:
     if len(mesh.faces) <= n_faces:
         return mesh
     open3d = require_open3d("--faces")
+    # Quadrics have products of coordinates, which lose their digits far from the origin.
+    middle = mesh.bounds.astype(np.float64).mean(axis=0)
     source = open3d.geometry.TriangleMesh(
-        open3d.utility.Vector3dVector(np.ascontiguousarray(mesh.vertices, np.float64)),
+        open3d.utility.Vector3dVector(mesh.vertices - middle),
         open3d.utility.Vector3iVector(np.ascontiguousarray(mesh.faces)),
     )
     source.vertex_normals = open3d.utility.Vector3dVector(np.ascontiguousarray(mesh.normals, np.float64))
@@ -65,7 +67,7 @@ def simplify_mesh(mesh: TriangleMesh, n_faces: int) -> TriangleMesh:
     if not whole.any():
         raise DataError(f"--faces: expected something left of {len(mesh.faces)} faces at {n_faces}, got none")
     used, numbers = np.unique(faces[whole], return_inverse=True)
-    vertices = np.asarray(result.vertices)[used]
+    vertices = np.asarray(result.vertices)[used] + middle
     faces = numbers.reshape(-1, 3).astype(np.int32)
     colours = np.empty((len(used), 4), np.uint8)
     colours[:, :3] = to_8_bit(np.asarray(result.vertex_colors)[used])

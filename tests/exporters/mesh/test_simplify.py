@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from exporters.mesh.simplify import simplify_mesh
+from exporters.shapes.mesh import crossed_edges
 from player.errors import ConfigError, MissingExtraError
 from tests.exporters.meshes import box, sphere
 
@@ -28,6 +29,17 @@ def test_a_sphere_keeps_its_shape_and_colours() -> None:
     volume = (a * np.cross(b, c)).sum() / 6
     # 800 flat faces cut 2 % off a ball's volume; it is positive if they still look outwards
     assert abs(volume / (4 / 3 * np.pi) - 1) < 0.04
+
+
+@pytest.mark.needs("open3d")
+def test_a_sphere_in_the_coordinates_of_a_map_keeps_its_shape() -> None:
+    mesh, middle = sphere(60), np.array([4.5e6, 5e5, 300.0])
+    few = simplify_mesh(replace(mesh, vertices=mesh.vertices + middle), 800)
+    areas = crossed_edges(few.vertices, few.faces) / 2
+    # 800 flat faces are a little smaller than a ball
+    assert 0.98 < np.linalg.norm(areas, axis=1).sum() / (4 * np.pi) < 1
+    outwards = few.vertices[few.faces].mean(axis=1) - middle
+    assert ((areas * outwards).sum(axis=1) > 0).all()
 
 
 @pytest.mark.needs("open3d")
