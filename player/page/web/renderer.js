@@ -141,7 +141,8 @@ export class Renderer {
   // or so many bits of a pixel in all of them.
   makeTile(nChannels) {
     const { gl } = this, n = foundTextures(nChannels), most = gl.getParameter(gl.MAX_DRAW_BUFFERS);
-    if (n + 1 > most) throw new Error(`WebGL2: expected ${n + 1} draw buffers for ${nChannels} channels, got ${most}`);
+    // Here and in `read`, the browser tells no limit if the context has just been lost.
+    if (most && n + 1 > most) throw new Error(`WebGL2: expected ${n + 1} draw buffers for ${nChannels} channels, got ${most}`);
     const made = (size, formats) => {
       const target = framebufferOf(gl, size, size, formats);
       if (isComplete(gl)) return target;
@@ -272,7 +273,7 @@ export class Renderer {
     const { gl } = this;
     if (this.lost) throw new Error(LOST);
     const most = gl.getParameter(gl.MAX_TEXTURE_SIZE);
-    if (view.width > most || view.height > most) throw new Error(`size: expected at most ${most}x${most}, got ${view.width}x${view.height}`);
+    if (most && Math.max(view.width, view.height) > most) throw new Error(`size: expected at most ${most}x${most}, got ${view.width}x${view.height}`);
     const bytes = new Uint8Array(4 * part[2] * part[3]), buffer = gl.createBuffer();
     try {
       this.paintTo(buffer, bytes.length, view, part, counting);

@@ -238,6 +238,35 @@ def test_a_renderer_waits_for_a_context_that_is_lost_while_its_shaders_are_compi
     assert (np.reshape(found, (camera.height, camera.width, 4)) == page.picture(camera)).all()
 
 
+def test_a_context_that_is_lost_just_before_its_limits_are_asked_for(page: RenderPage, asset: Asset) -> None:
+    """A lost context tells no limits. It is lost for a renderer that is being made, which waits for it, and
+    then for a picture."""
+    camera = scenes.cameras(asset)["outside"]
+    told, found = page.page.evaluate(
+        f"""async (view) => {{
+          {LOST_AND_BACK}
+          const canvas = document.createElement("canvas"), gl = canvas.getContext("webgl2");
+          const {{ getParameter }} = gl;
+          const lostAt = (name) => new Promise((go) => {{
+            gl.getParameter = (asked) => {{
+              if (asked === gl[name]) go(lostAndBack(canvas, async () => delete gl.getParameter));
+              return getParameter.call(gl, asked);
+            }};
+          }});
+          const first = lostAt("MAX_DRAW_BUFFERS");
+          const made = await renderer.constructor.create(canvas, renderer.scene);
+          await first;
+          const second = lostAt("MAX_TEXTURE_SIZE");
+          const told = await made.render(view).catch((error) => error.message);
+          await second;
+          return [told, [...(await made.render(view)).rgba]];
+        }}""",
+        view_of(camera),
+    )
+    assert told == "WebGL2: expected a context, got one that was lost"
+    assert (np.reshape(found, (camera.height, camera.width, 4)) == page.picture(camera)).all()
+
+
 def test_nobody_waits_for_what_was_drawn_before_a_context_was_lost_and_came_back(page: RenderPage) -> None:
     told = page.page.evaluate(
         f"""async () => {{
