@@ -35,6 +35,17 @@ def write_tensors(path: Path, content: dict[str, Any]) -> None:
     write_bytes(path, buffer.getvalue())
 
 
+def on_cpu(content: Any) -> Any:
+    """Copy plain values, with every tensor in them moved to the CPU."""
+    if isinstance(content, torch.Tensor):
+        return content.cpu()
+    if isinstance(content, dict):
+        return {key: on_cpu(value) for key, value in content.items()}
+    if isinstance(content, list | tuple):
+        return type(content)(on_cpu(value) for value in content)
+    return content
+
+
 def read_tensors(path: Path, what: str, max_memory: float | None = None, from_elsewhere: bool = False) -> Any:
     """Return the content of the file `path`, with its tensors on the CPU.
 

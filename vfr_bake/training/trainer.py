@@ -53,6 +53,7 @@ from vfr_bake.training.pixel_tensors import pixel_content, restore_witnesses
 from vfr_bake.training.processes import Processes
 from vfr_bake.training.rays import Batch, DevicePixelSampler, PixelSampler
 from vfr_bake.training.scores.between import WitnessPsnr, witness_psnr
+from vfr_bake.training.tensor_files import on_cpu
 
 SOLID = 0.9
 """A picture's exposure is judged by rays where the field's opacity and the photograph's alpha exceed this."""
@@ -440,7 +441,9 @@ class Trainer:
         return [parameter.grad for parameter in learning if parameter.grad is not None]
 
     def state(self) -> dict[str, Any]:
-        """Return all that later steps depend on, as CPU tensors and plain values."""
+        """Return all that later steps depend on, as CPU tensors and plain values. Without the next batch in
+        several processes, which would all go on with the share of the one that writes the checkpoint."""
+        following = self._next if self.processes.size == 1 else None
         state = {
             "step": self.next_step,
             "seconds": self.seconds,
@@ -455,9 +458,9 @@ class Trainer:
             "pixels": self._pixels.position,
             "effects": self.effects.state(),
             "duration": self.duration.state(),
-            "next": None if self._next is None else self._next.state(),
+            "next": None if following is None else following.state(),
         }
-        return state if self.device.type == "cpu" else _on_cpu(state)
+        return state if self.device.type == "cpu" else on_cpu(state)
 
     def restore(self, state: dict[str, Any]) -> None:
         """Continue from what `state` returned, as if there had been no interruption."""
@@ -487,14 +490,3 @@ def choose_device(name: str) -> torch.device:
     if name == "cuda" and not there:
         raise ConfigError("device: expected a GPU that torch can run CUDA on, got none: pass --device cpu")
     return torch.device("cuda" if there and name != "cpu" else "cpu")
-
-
-def _on_cpu(state: Any) -> Any:
-    """Copy plain values, with every tensor in them moved to the CPU."""
-    if isinstance(state, Tensor):
-        return state.cpu()
-    if isinstance(state, dict):
-        return {key: _on_cpu(value) for key, value in state.items()}
-    if isinstance(state, list | tuple):
-        return type(state)(_on_cpu(value) for value in state)
-    return state

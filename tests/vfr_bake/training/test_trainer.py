@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import itertools
 import math
 import weakref
@@ -13,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from torch import distributed
 
 from player.errors import ConfigError, FormatError, TrainingError
 from vfr_bake.config import FieldOptions, SceneKind, TrainConfig
@@ -27,7 +29,8 @@ from vfr_bake.training.checkpoint import load_checkpoint, save_checkpoint
 from vfr_bake.training.gradients import CERTAIN, chosen_rays, scale_near_gradients
 from vfr_bake.training.model_file import trained_model
 from vfr_bake.training.optimiser import DENSITY_DECAY
-from vfr_bake.training.rays import PixelSampler, RayBatch
+from vfr_bake.training.processes import Processes
+from vfr_bake.training.rays import Batch, PixelSampler, RayBatch
 from vfr_bake.training.scores.evaluation import render_views
 from vfr_bake.training.trainer import Trainer
 
@@ -298,6 +301,26 @@ def test_pixels_for_a_bake_are_those_that_training_learns_from(scene: Scene) -> 
     opaque = every.rgba[:, 3] == 255
     assert 0 < len(masked.pixels) < len(every.pixels) and (masked.rgba[:, 3] == 255).all()
     assert len(masked.pixels) >= opaque.sum(), "witnesses that are masked are none"
+
+
+def test_each_process_goes_on_with_its_own_share(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The first of two processes writes the checkpoint that both restore."""
+    monkeypatch.setattr(distributed, "all_reduce", lambda *_: None)
+    two = [Trainer(scene, config(steps=9, pilot_steps=1), Processes(rank, 2)) for rank in range(2)]
+    next(steps := two[0].run())
+    assert next(steps).step == 1 and two[0]._next is not None
+    state = two[0].state()
+    served = []
+    for trainer in two:
+        trainer.restore(copy.deepcopy(state))
+
+        def spy(batch: Batch, *rest: Any, error: Any = trainer._error) -> Any:
+            served.append(batch.rays_d)
+            return error(batch, *rest)
+
+        monkeypatch.setattr(trainer, "_error", spy)
+        next(trainer.run())
+    assert not torch.equal(*served)
 
 
 def test_a_restored_training_holds_its_pictures_once(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
