@@ -8,7 +8,7 @@ import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -17,16 +17,13 @@ from playwright.sync_api import Browser, Page, Route
 from exporters.export import export_asset
 from exporters.options import ExportOptions
 from player.asset.asset import Asset
-from player.cameras.camera import Camera
 from player.errors import ConfigError, FormatError
 from player.page import page
 from player.page.gpu_memory import MOST_CHANNELS, feature_bytes
 from player.page.modules import joined
 from player.page.page import page_of_many_files, page_of_one_file, page_script, web_files
-from player.page.rest import rest_camera
 from player.page.scene_files import scene_files
 from player.page.text_bytes import ALPHABET, bytes_of_text, text_of_bytes
-from tests.player.conftest import look_at
 from tests.player.page import scenes
 from tests.player.page.viewer_page import wait_for
 
@@ -406,60 +403,6 @@ def test_a_page_that_was_changed_says_so(
         assert "changed on its way" in found.page.inner_text("body")
         told = found.page.evaluate("() => vfr.render({}).then(() => null, (error) => error.message)")
         assert "changed on its way" in told
-
-
-# --- what it begins with ---
-
-
-def cameras(angles: list[float], elevation: float = 0.4) -> list[Camera]:
-    found = []
-    for i, angle in enumerate(np.deg2rad(angles).tolist()):
-        eye = np.array([np.cos(angle), np.sin(angle), np.tan(elevation)]) * 3 + [1, 2, 3]
-        pose = look_at(tuple(eye.tolist()), (1.0, 2.0, 3.0))
-        found.append(Camera(f"{i}", pose, 60, 40, 50.0, 52.0, 31.0, 19.0))
-    return found
-
-
-def test_it_begins_in_the_middle_of_the_cameras() -> None:
-    rest = rest_camera(cameras([10, 20, 60, 70]))
-    wanted = look_at(
-        tuple(
-            (np.array([np.cos(np.deg2rad(40)), np.sin(np.deg2rad(40)), np.tan(0.4)]) * 3 + [1, 2, 3]).tolist()
-        ),
-        (1.0, 2.0, 3.0),
-    )
-    assert np.allclose(rest.c2w, wanted, atol=2e-3)  # up leans a little towards the cameras' own
-    assert (rest.width, rest.fx, rest.cx, rest.cy) == (60, 50.0, 30.0, 20.0)
-    all_around = cameras([30, 120, 210, 300])
-    assert np.allclose(rest_camera(all_around).c2w, all_around[0].c2w, atol=1e-4)
-
-
-REST = """
-import { restOf, viewOf } from "./pose.js";
-globalThis.rest = (cameras, width, height) => {
-  const { frame, pose } = restOf(cameras);
-  return viewOf(frame, pose, width, height);
-};
-"""
-
-
-def test_the_poster_shows_what_the_viewer_begins_with(chromium: Browser, tmp_path: Path) -> None:
-    script = page_script({**web_files(), "main.js": REST}, "main.js", "main.js")
-    path = tmp_path / "rest.html"
-    path.write_text(f'<!doctype html><script type="module">{script}</script>')
-    with opened(chromium, path.as_uri()) as found:
-        for some in (cameras([10, 20, 60, 70]), cameras([0, 90, 180, 270]), cameras([200], 1.3)):
-            rest = rest_camera(some)
-            given: list[dict[str, Any]] = [
-                {**{k: getattr(c, k) for k in ("name", "width", "height", "fx", "fy", "cx", "cy")},
-                 "c2w": c.c2w.reshape(-1).tolist()}
-                for c in some
-            ]  # fmt: skip
-            view = found.page.evaluate("([c, w, h]) => rest(c, w, h)", [given, 60, 40])
-            assert np.allclose(np.reshape(view["c2w"], (4, 4)), rest.c2w, atol=1e-6)
-            assert np.allclose(
-                [view[k] for k in ("fx", "fy", "cx", "cy")], [rest.fx, rest.fy, rest.cx, rest.cy]
-            )
 
 
 def test_an_installed_package_has_the_files_of_the_page() -> None:

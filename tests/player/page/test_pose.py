@@ -98,16 +98,47 @@ def test_the_first_view_is_level_and_in_the_middle(call: Call, eyes: np.ndarray)
         np.testing.assert_allclose(c2w[:3, 3], middle, atol=0.05)
 
 
+def around(angles: list[float], elevation: float = 0.4) -> list[Camera]:
+    """Return cameras that look at (1, 2, 3) from angles in degrees around it."""
+    found = []
+    for i, angle in enumerate(np.deg2rad(angles).tolist()):
+        eye = np.array([np.cos(angle), np.sin(angle), np.tan(elevation)]) * 3 + [1, 2, 3]
+        pose = look_at(tuple(eye.tolist()), (1.0, 2.0, 3.0))
+        found.append(Camera(f"{i}", pose, 60, 40, 50.0, 52.0, 31.0, 19.0))
+    return found
+
+
+def test_the_poster_is_seen_from_the_middle_of_the_cameras() -> None:
+    rest = rest_camera(around([10, 20, 60, 70]))
+    (wanted,) = around([40])
+    assert np.allclose(rest.c2w, wanted.c2w, atol=2e-3)  # up leans a little towards the cameras' own
+    assert (rest.width, rest.fx, rest.cx, rest.cy) == (60, 50.0, 30.0, 20.0)
+    all_around = around([30, 120, 210, 300])
+    assert np.allclose(rest_camera(all_around).c2w, all_around[0].c2w, atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    "views", [around([10, 20, 60, 70]), around([0, 90, 180, 270]), around([200], 1.3)], ids=len
+)
+def test_the_poster_shows_what_the_viewer_begins_with(call: Call, views: list[Camera]) -> None:
+    check_first_view(call, views)
+
+
+def check_first_view(call: Call, views: list[Camera]) -> tuple[dict[str, Any], Camera]:
+    """Check that the viewer begins with the poster's view; return what it begins with and that view."""
+    found, camera = call("restOf", as_json(views)), rest_camera(views)
+    view = call("viewOf", found["frame"], found["pose"], camera.width, camera.height)
+    np.testing.assert_allclose(np.reshape(view["c2w"], (4, 4)), camera.c2w, atol=1e-6)
+    for key in ("fx", "fy", "cx", "cy"):
+        assert view[key] == pytest.approx(getattr(camera, key))
+    return found, camera
+
+
 def test_the_first_view_of_an_object_and_of_a_capture(call: Call, lego_400: Path, fox: Path) -> None:
     """The first view is the poster's; for a capture it is among the cameras, in front of what they see."""
     for path in (lego_400 / "transforms_train.json", fox / "transforms.json"):
         views = read_views(path, (400, 400))
-        found = call("restOf", as_json(views))
-        camera = rest_camera(views)
-        view = call("viewOf", found["frame"], found["pose"], camera.width, camera.height)
-        np.testing.assert_allclose(np.reshape(view["c2w"], (4, 4)), camera.c2w, atol=1e-6)
-        for key in ("fx", "fy", "cx", "cy"):
-            assert view[key] == pytest.approx(getattr(camera, key))
+        found, camera = check_first_view(call, views)
         places = np.stack([view.c2w[:3, 3] for view in views])
         apart = np.linalg.norm(places - camera.c2w[:3, 3], axis=-1) / found["frame"]["radius"]
         assert apart.min() < 0.25 and abs(camera.c2w[:3, 0] @ world_up(views)) < 1e-6
