@@ -35,6 +35,7 @@ from vfr_bake.config import BakeConfig
 from vfr_bake.kernels.stored_features import descend, descend_density, padded, slants, weigh
 from vfr_bake.presets import BakeChoice
 from vfr_bake.training.length.expectation import typical_step
+from vfr_bake.training.length.stopwatch import Stopwatch
 from vfr_bake.training.muon import Muon
 
 N_CALIBRATION = 20_000
@@ -258,6 +259,7 @@ class Tuning:
         if name == "head at k":
             seconds = max(seconds, HEAD_SECONDS)
         yield (steps := Steps(asked, self._progress(name), seconds))
+        self._until += steps.paused
         if steps.n < asked:
             self.left_out[f"steps of {name!r}"] = (
                 f"{asked - steps.n:,} of {asked:,}: they would take too long"
@@ -335,15 +337,21 @@ class Steps:
     def __init__(self, n_steps: int, progress: Progress, seconds: float = float("inf")) -> None:
         """`seconds` is the time that the steps may take."""
         self.n = n_steps
+        self.paused = 0.0
+        """Seconds of the steps so far in which the machine slept, or the process was stopped."""
         self._progress, self._seconds = progress, seconds
 
     def __iter__(self) -> Iterator[int]:
         step, ends = 0, list[float]()
+        begin = time.perf_counter()  # the monotonic clock of Windows moves on by 16 ms at once
+        watch = Stopwatch(0.0, begin)
         while step < self.n:
             yield step
             step += 1
+            now = time.perf_counter()
+            self.paused = now - begin - watch.step_ends(now)
             if N_WARM <= step <= N_WARM + N_TIMED:
-                ends.append(time.perf_counter())  # the monotonic clock of Windows moves on by 16 ms at once
+                ends.append(now)
             if step == N_WARM + N_TIMED:
                 self.n = max(int(min(self.n, self._seconds / typical_step(ends))), step)
             if step % 50 == 0 or step == self.n:

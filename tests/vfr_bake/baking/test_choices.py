@@ -20,6 +20,7 @@ from vfr_bake.baking.distillation import render_teacher
 from vfr_bake.baking.held_out import Shown
 from vfr_bake.config import BakeConfig, FieldOptions, TrainConfig
 from vfr_bake.presets import PRESETS
+from vfr_bake.training.length.stopwatch import LONGEST_STEP
 from vfr_bake.training.length.witness_loss import Loss
 from vfr_bake.training.model_file import Model
 
@@ -94,6 +95,19 @@ def test_lookups_are_enough_for_pixels_not_to_stand_out(
     )
     assert tuning._choose_lookups(None, None) == tuning.n_fetches == k  # type: ignore[arg-type]
     assert set(tuning.lookups.values()) == {0.0}
+
+
+def test_a_pause_in_a_round_takes_no_time_from_the_next(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = 0.0
+    clock = SimpleNamespace(monotonic=lambda: now, perf_counter=lambda: now)
+    monkeypatch.setattr(refinement, "time", clock)
+    tuning = refinement.Tuning(BakeConfig(), PRESETS["fast"], None, lambda name: silent, 100.0)  # type: ignore[arg-type]
+    with tuning._steps("refinement", 1000) as steps:
+        for step in steps:
+            now += 2**-6
+            now += 3600 if step == 500 else 0  # the machine sleeps
+    assert not tuning.left_out
+    assert tuning._seconds_left() == pytest.approx(100 - 999 / 2**6 - LONGEST_STEP)
 
 
 @pytest.mark.parametrize(("max_loss_db", "steps"), [(None, (1, 2, 4)), (0.5, (1, 2, 2)), (0.4, (1, 1, 1))])
