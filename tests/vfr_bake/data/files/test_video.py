@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
+import av
 import cv2
 import numpy as np
 import pytest
@@ -120,6 +122,68 @@ def test_the_check_of_a_video_reports_its_frames(short_video: Path):
     calls: list[tuple[int, int]] = []
     check_data(str(short_video), WorkingSize(), 60.0, lambda *call: calls.append(call))
     assert (12, 12) in calls
+
+
+SRGB_COLOUR = (200, 90, 60)
+WHITE_NITS = 203.0
+"""Luminance of white in videos of high dynamic range (ITU-R BT.2408)."""
+BT2020_FROM_BT709 = np.array([[0.6274, 0.3293, 0.0433], [0.0691, 0.9195, 0.0114], [0.0164, 0.0880, 0.8956]])
+
+
+def hlg(linear: np.ndarray) -> np.ndarray:
+    """Return the signal of ITU-R BT.2100, table 5, for a display of 1,000 nits; `linear`: 1 is white."""
+    shown = BT2020_FROM_BT709 @ linear * WHITE_NITS / 1000
+    light = shown * (shown @ [0.2627, 0.6780, 0.0593]) ** (1 / 1.2 - 1)
+    bright = 0.17883277 * np.log((12 * light - 0.28466892).clip(1e-9)) + 0.55991073
+    return np.where(light <= 1 / 12, np.sqrt(3 * light), bright)
+
+
+def pq(linear: np.ndarray) -> np.ndarray:
+    """Return the signal of ITU-R BT.2100, table 4; `linear`: 1 is white."""
+    power = (BT2020_FROM_BT709 @ linear * WHITE_NITS / 10_000) ** 0.1593017578125
+    return ((0.8359375 + 18.8515625 * power) / (1 + 18.6875 * power)) ** 78.84375
+
+
+def bt709(linear: np.ndarray) -> np.ndarray:
+    return np.array(SRGB_COLOUR) / 255
+
+
+@pytest.mark.parametrize(
+    ("signal", "codes", "shares", "most_off"),
+    [
+        # FFmpeg fits high dynamic range and wider primaries into sRGB by rules of its own.
+        (hlg, (9, 18, 9), (0.2627, 0.0593), 16),
+        (pq, (9, 16, 9), (0.2627, 0.0593), 16),
+        (bt709, (1, 1, 1), (0.2126, 0.0722), 2),
+    ],
+)
+def test_colours_of_a_video(
+    tmp_path: Path, signal: Any, codes: Any, shares: tuple[float, float], most_off: int
+) -> None:
+    """Phones record BT.709, or in high dynamic range HLG or PQ with the primaries of BT.2020. `codes`:
+    primaries, transfer and matrix (ITU-T H.273). `shares`: of red and blue in luma."""
+    srgb = np.array(SRGB_COLOUR) / 255
+    red, green, blue = signal(((srgb + 0.055) / 1.055) ** 2.4)
+    luma = shares[0] * red + (1 - sum(shares)) * green + shares[1] * blue
+    chroma = (blue - luma) / (1 - shares[1]), (red - luma) / (1 - shares[0])
+    frame = av.VideoFrame(64, 64, "yuv420p10le")
+    levels = 64 + 876 * luma, 512 + 448 * chroma[0], 512 + 448 * chroma[1]
+    for plane, level in zip(frame.planes, levels, strict=True):
+        plane.update(np.full(plane.buffer_size // 2, round(level), "<u2").tobytes())
+    with av.open(tmp_path / "a.mov", "w") as file:
+        stream = file.add_stream("libx265", 30, options={"x265-params": "log-level=none:lossless=1"})
+        stream.width, stream.height, stream.pix_fmt = 64, 64, "yuv420p10le"
+        context = stream.codec_context
+        context.color_primaries, context.color_trc, context.colorspace = codes
+        context.color_range = 1
+        for number in range(3):
+            frame.pts = number
+            file.mux(stream.encode(frame))
+        file.mux(stream.encode())
+    folder = video.extract_frames(tmp_path / "a.mov", lambda done, of: None)
+    with Image.open(folder / "images" / "0000.jpg") as picture:
+        found = np.asarray(picture)[32, 32].astype(int)
+    assert np.abs(found - SRGB_COLOUR).max() <= most_off
 
 
 def test_a_file_that_is_no_video(tmp_path: Path, capfd: pytest.CaptureFixture[str]):
