@@ -50,6 +50,7 @@ def scene_files(asset: Asset) -> dict[str, bytes]:
         files |= {part.file: asset.read(part.file) for part in manifest.parts}
     else:
         stored = asset.arrays
+        stored.check(manifest)
         written = write_parts(stored.densities, stored.features, manifest, 0, 0)
         manifest = replace(manifest, parts=tuple(each.part for each in written))
         files |= {each.part.file: each.data for each in written}

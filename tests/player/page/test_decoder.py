@@ -15,14 +15,17 @@ from playwright.sync_api import Browser
 
 from player.asset.asset import Asset, GridArrays, write_asset
 from player.asset.pyramid import Bricks, Pyramid, PyramidValues
+from player.asset.version_3.unpacking import read_arrays
 from player.cameras.views import asset_cameras
-from player.errors import ConfigError
+from player.errors import ConfigError, FormatError
 from player.head.head import asset_head
 from player.page import page
 from player.page.scene_files import scene_files
+from tests.player.asset.test_asset import replace_file
 from tests.player.asset.test_parts import MANIFEST, STEPS, cells, stored
 from tests.player.conftest import cameras_bytes, head_bytes
 from tests.player.page.decoder_page import decoded, decoder_page, expected, without_problem
+from tests.version_3 import pack_codes, pack_masks
 
 OLD = Path(__file__).parents[1] / "asset" / "version_3_1" / "asset"
 Files = dict[str, bytes]
@@ -84,6 +87,18 @@ def test_one_level_is_decoded(chromium: Browser, asset: Asset, tmp_path: Path) -
 
 def test_an_asset_of_version_3_is_decoded(chromium: Browser, tmp_path: Path) -> None:
     check(chromium, tmp_path, Asset.open(OLD))
+
+
+def test_an_asset_of_version_3_whose_features_form_no_cell_is_refused(tmp_path: Path) -> None:
+    folder = Path(shutil.copytree(OLD, tmp_path / "old"))
+    n = len(read_arrays(folder, Asset.open(folder).manifest, 1 << 40)[1].coords)
+    one_each = np.zeros((n, 8), np.uint64)
+    one_each[:, 0] = 1
+    replace_file(folder, "feature_masks.bits", pack_masks(one_each))
+    n_channels = Asset.open(OLD).manifest.n_channels
+    replace_file(folder, "features.codes", pack_codes(np.zeros((n, n_channels), np.int8)))
+    with pytest.raises(FormatError, match="features: expected at least one live cell, got none"):
+        page(Asset.open(folder))
 
 
 def test_large_symbols_an_empty_and_a_full_grid(chromium: Browser, tmp_path: Path) -> None:
