@@ -292,9 +292,7 @@ class _Bake:
         more than the preset allows."""
         head, most = self.model.field.head, self.choice.n_channels
         some = teacher.some(N_PROJECTED)
-        features, opacity, _ = self.model.sampler.composited_features(
-            self.model.field, some.rays_o, some.rays_d
-        )
+        features, opacity = self.model.sampler.composited_features(self.model.field, some.rays_o, some.rays_d)
         sensitivity = head_sensitivity(head, features, some.rays_d, opacity)
         every = project(sensitivity, features, most)
         if self.config.n_channels is not None:

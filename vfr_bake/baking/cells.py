@@ -214,10 +214,10 @@ def _shown(model: Model, held_out: HeldOut, cells: np.ndarray) -> Shown:
     distance = np.empty(cells.shape, np.uint8)
     chebyshev_distance(cells, distance)
     features = np.zeros((len(held_out.rays_o), model.field.config.n_channels), np.float32)
-    opacity, depth = np.zeros((2, len(features)), np.float32)
+    opacity = np.zeros(len(features), np.float32)
     render_features(
         held_out.rays_o, held_out.rays_d, np.float32(model.occupancy.step), distance,
-        model.field.arrays(), LIMITS, features, opacity, depth,
+        model.field.arrays(), LIMITS, features, opacity,
     )  # fmt: skip
     return held_out.compare(features, opacity)
 

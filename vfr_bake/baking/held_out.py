@@ -179,7 +179,7 @@ class HeldOut:
         self._n_learned = 0 if learned is None else len(learned.pixels)
         self.rays_o, self.rays_d = (np.concatenate(column) for column in zip(*rays, strict=True))
         self.background = model.background
-        features, opacity, _ = model.sampler.composited_features(model.field, self.rays_o, self.rays_d)
+        features, opacity = model.sampler.composited_features(model.field, self.rays_o, self.rays_d)
         self._hits = np.flatnonzero(opacity > 0)
         self._features, self._opacity = features[self._hits], opacity[self._hits, None]
         self._field = model.field

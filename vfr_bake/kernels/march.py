@@ -130,9 +130,9 @@ def march_samples(
 
 
 @njit(parallel=True, cache=True, fastmath=FLAGS, error_model="numpy")
-def render_features(rays_o, rays_d, step, distance, field, limits, out, opacity, depth):
+def render_features(rays_o, rays_d, step, distance, field, limits, out, opacity):
     """Composite features along rays without storing samples: add them to `out` [n_rays, n_channels], which
-    must be 0 before, and write `opacity` [n_rays] and `depth` [n_rays] (mean t)."""
+    must be 0 before, and write `opacity` [n_rays]."""
     kind = rays_o.dtype.type
     half = kind(0.5)
     block = 64
@@ -144,10 +144,9 @@ def render_features(rays_o, rays_d, step, distance, field, limits, out, opacity,
             t_near, t_far = ray_box(rays_o, rays_d, ray)
             tau = kind(0)
             trans = kind(1)
-            t_sum = kind(0)
             i = 0
             while tau <= limits.opaque_depth:
-                i, t, ux, uy, uz = next_sample(rays_o, rays_d, ray, t_near, t_far, i, half, step, distance)
+                i, _, ux, uy, uz = next_sample(rays_o, rays_d, ray, t_near, t_far, i, half, step, distance)
                 if i < 0:
                     break
                 i += 1
@@ -155,11 +154,9 @@ def render_features(rays_o, rays_d, step, distance, field, limits, out, opacity,
                 weight = -trans * np.expm1(-delta)
                 for c in range(out.shape[1]):
                     out[ray, c] += weight * feature[c]
-                t_sum += weight * t
                 tau += delta
                 trans = np.exp(-tau)
             opacity[ray] = -np.expm1(-tau)
-            depth[ray] = t_sum / opacity[ray] if tau > 0 else kind(0)
 
 
 @njit(cache=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -14,17 +14,6 @@ from vfr_bake.kernels import compositing as kernels
 from vfr_bake.kernels.density import LARGEST_LOGIT
 from vfr_bake.kernels.head.activations import relu_backward
 from vfr_bake.torch_kernels.compositing import Composite
-
-
-class RayFeatures(NamedTuple):
-    """Composited features of rays, before the head gives them colour."""
-
-    features: np.ndarray
-    """[n_rays, n_channels], composited."""
-    opacity: np.ndarray
-    """[n_rays]."""
-    depth: np.ndarray
-    """[n_rays] mean distance, model units; 0 where nothing is met."""
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from torch import Tensor
 from vfr_bake.field.field import VfrField
 from vfr_bake.kernels.density import LIMITS
 from vfr_bake.kernels.march import chebyshev_distance, render_features
-from vfr_bake.rendering.compositing import RayFeatures, RaySamples
+from vfr_bake.rendering.compositing import RaySamples
 from vfr_bake.rendering.sampling import LOOKUP_POINTS, march, most_samples
 
 OPACITY_THRESHOLD = 0.03
@@ -107,16 +107,16 @@ class OccupancyGrid:
             occupied = np.ones_like(occupied)  # nothing found yet: look everywhere rather than nowhere
         chebyshev_distance(occupied, self.distance)
 
-    def composited_features(self, field: VfrField, rays_o: np.ndarray, rays_d: np.ndarray) -> RayFeatures:
-        """Composite the field's features along rays `rays_o`, `rays_d` [n_rays, 3], with
-        a lookup at every sample."""
+    def composited_features(
+        self, field: VfrField, rays_o: np.ndarray, rays_d: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Composite the field's features along rays `rays_o`, `rays_d` [n_rays, 3], with a lookup at every
+        sample; return (features [n_rays, n_channels], opacity [n_rays])."""
         features = np.zeros((len(rays_o), field.config.n_channels), np.float32)
-        opacity, depth = np.zeros((2, len(rays_o)), np.float32)
-        render_features(
-            rays_o, rays_d, np.float32(self.step), self.distance, field.arrays(), LIMITS, features, opacity,
-            depth,
-        )  # fmt: skip
-        return RayFeatures(features, opacity, depth)
+        opacity = np.zeros(len(rays_o), np.float32)
+        step = np.float32(self.step)
+        render_features(rays_o, rays_d, step, self.distance, field.arrays(), LIMITS, features, opacity)
+        return features, opacity
 
     def sample_all(self, field: VfrField, rays_o: np.ndarray, rays_d: np.ndarray) -> RaySamples:
         """Return the samples of all rays, in the middle of their intervals."""

@@ -19,7 +19,7 @@ from vfr_bake.field.hash_grid import GridLayout, zeros
 from vfr_bake.kernels import proposals as kernels
 from vfr_bake.kernels.density import LIMITS
 from vfr_bake.kernels.proposals import Round
-from vfr_bake.rendering.compositing import RayFeatures, RaySamples, composite
+from vfr_bake.rendering.compositing import RaySamples, composite
 
 N_PROPOSED = 64
 """Intervals in each of the two rounds."""
@@ -66,20 +66,22 @@ class ProposalSampler(nn.Module):
         return self.sample_rounds(field, torch.from_numpy(rays_o), torch.from_numpy(rays_d), middle)[0]
 
     @torch.no_grad()
-    def composited_features(self, field: VfrField, rays_o: np.ndarray, rays_d: np.ndarray) -> RayFeatures:
-        """Composite the field's features along rays `rays_o`, `rays_d` [n_rays, 3], with
-        a lookup at every sample."""
+    def composited_features(
+        self, field: VfrField, rays_o: np.ndarray, rays_d: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Composite the field's features along rays `rays_o`, `rays_d` [n_rays, 3], with a lookup at every
+        sample; return (features [n_rays, n_channels], opacity [n_rays])."""
         features = np.empty((len(rays_o), field.config.n_channels), np.float32)
-        opacity, depth = np.empty((2, len(rays_o)), np.float32)
+        opacity = np.empty(len(rays_o), np.float32)
         for start in range(0, len(rays_o), RAY_CHUNK):
             rows = slice(start, start + RAY_CHUNK)
             samples = self.sample_all(field, rays_o[rows], rays_d[rows])
             assert samples.sigmas is not None
-            values = torch.cat([samples.features, samples.t_mid[:, None]], dim=1)
-            out, alpha, _ = composite(samples.sigmas, values, samples.deltas, samples.starts, samples.counts)
-            features[rows], opacity[rows] = out[:, :-1].numpy(), alpha.numpy()
-            depth[rows] = (out[:, -1] / alpha.clamp(min=1e-10)).numpy()
-        return RayFeatures(features, opacity, depth)
+            found = composite(
+                samples.sigmas, samples.features, samples.deltas, samples.starts, samples.counts
+            )
+            features[rows], opacity[rows] = found[0].numpy(), found[1].numpy()
+        return features, opacity
 
     def sample_rounds(
         self,

@@ -79,7 +79,7 @@ def _colours_of_features(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Composite features, then colour them with one evaluation of the head per ray (equation 3): return
     (colours times opacity [n_rays, 3], opacity [n_rays])."""
-    features, opacity, _ = sampler.composited_features(field, rays_o, rays_d)
+    features, opacity = sampler.composited_features(field, rays_o, rays_d)
     colours = np.zeros((len(rays_o), 3), np.float32)
     hit = np.flatnonzero(opacity > 0)
     colours[hit] = head_colours(field, features[hit], rays_d[hit]) * opacity[hit, None]

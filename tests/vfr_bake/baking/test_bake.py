@@ -151,7 +151,7 @@ def test_coarse_pictures_leave_no_hole_in_a_fine_grid(model: Model, fine: tuple[
     camera, in_model = model.cameras[3], model.model_cameras()[3]
     large = camera.resized(256, 256)
     played = render(Asset.open(fine[0]), large, n_fetches=0)
-    _, opacity, _ = model.occupancy.composited_features(model.field, *in_model.resized(256, 256).rays())
+    _, opacity = model.occupancy.composited_features(model.field, *in_model.resized(256, 256).rays())
     solid = opacity.reshape(256, 256) > 0.95
     assert solid.mean() > 0.1
     assert (played.opacity[solid] < 0.5).mean() < 0.002

@@ -140,7 +140,7 @@ def test_photographed_rays_show_the_mean_of_photographs_and_model(model: Model) 
     for view in (0, int(views[-1])):
         camera = model.cameras[view].transformed(np.linalg.inv(model.world_from_model))
         origins, directions = camera.rays_through(rows[view])
-        features, opacity, _ = model.sampler.composited_features(model.field, origins, directions)
+        features, opacity = model.sampler.composited_features(model.field, origins, directions)
         colours = head_colours(model.field, features, directions) * opacity[:, None]
         of_view = views == view
         np.testing.assert_allclose(rays.rays_o[of_view], origins, atol=1e-6)

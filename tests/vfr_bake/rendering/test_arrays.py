@@ -88,8 +88,8 @@ for kind in ("object", "unbounded"):
         found["visible"] = visible
     for name in ("t_mid", "deltas", "points", "features", "counts"):
         found[f"{kind} {name}"] = getattr(samples, name).detach().numpy()
-    features, opacity, depth = sampler.composited_features(field, rays_o[:2].numpy(), rays_d[:2].numpy())
-    found |= {f"{kind} rgb": features, f"{kind} opacity": opacity, f"{kind} depth": depth}
+    features, opacity = sampler.composited_features(field, rays_o[:2].numpy(), rays_d[:2].numpy())
+    found |= {f"{kind} rgb": features, f"{kind} opacity": opacity}
     optimiser = (GridAdam if unbounded else FusedGridAdam)(field.grid.table if unbounded else field.grid)
     field.grid(samples.points[:20]).square().sum().backward()
     optimiser.step(0.01)

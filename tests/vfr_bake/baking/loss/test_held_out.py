@@ -109,7 +109,7 @@ def test_the_cameras_of_whole_views_are_not_looked_through(model: Model) -> None
 
 def test_what_shows_the_models_pictures_loses_nothing(model: Model) -> None:
     held_out = HeldOut(model, 1)
-    features, opacity, _ = model.sampler.composited_features(model.field, held_out.rays_o, held_out.rays_d)
+    features, opacity = model.sampler.composited_features(model.field, held_out.rays_o, held_out.rays_d)
     own = held_out.compare(features, opacity)
     assert own.error < 1e-12 and held_out.channel_loss(np.eye(features.shape[1])).db == 0
     dimmed = held_out.compare(features, 0.5 * opacity)
@@ -143,7 +143,7 @@ def test_a_change_that_knows_the_photographs_is_measured(model: Model) -> None:
     """A change that depends on the photographs, such as half of the opacity, is measured at the training
     pixels: it loses decibels, of which the estimate for independent errors says little."""
     held_out = HeldOut(model, 1)
-    features, opacity, _ = model.sampler.composited_features(model.field, held_out.rays_o, held_out.rays_d)
+    features, opacity = model.sampler.composited_features(model.field, held_out.rays_o, held_out.rays_d)
     own, dimmed = (held_out.compare(features, share * opacity) for share in (1.0, 0.5))
     assert held_out._learned is not None and own.learned is not None and dimmed.learned is not None
     measured = held_out._learned.loss(own.learned, dimmed.learned)
