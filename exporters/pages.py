@@ -34,8 +34,8 @@ def export_page(
         `bytes`, `viewer_bytes` and `gpu_bytes`, described in `exporters.export.export_asset`.
 
     Raises:
-        ConfigError: the page needs more graphics memory than it may take, or browsers cannot draw so many
-            channels.
+        ConfigError: the page needs more graphics memory than it may take, or more memory or channels than
+            browsers have.
         FormatError: a file of the asset is broken.
         OutputError: the target cannot be written.
         ParityError: the bytes that were to be written do not hold the asset's data.

@@ -1,4 +1,5 @@
-"""The graphics memory that an asset's page takes for the textures that `grid.js` and `textures.js` make."""
+"""The memory that an asset's page takes: that of the graphics card for the textures which `grid.js` and
+`textures.js` make, and that of the device while `parts.js` decodes the scene."""
 
 from __future__ import annotations
 
@@ -28,6 +29,19 @@ guarantees four buffers, graphics cards have eight, and the renderer of Chromium
 has six. Phones and tablets of Apple also limit the bits of a pixel in all buffers together, to 512, or 256
 where they are older. A buffer of eight channels has 128 bits and that of the opacity 64, so that they draw at
 most 24 or 8 channels; there `renderer.js` refuses a page with more."""
+
+MOST_DECODING_BYTES = 3_200_000_000
+"""Most bytes of memory that a page may take to decode a scene: MOST_BYTES in `parts.js`."""
+
+
+def decoding_bytes(asset: Asset) -> int:
+    """Return the most bytes of memory that a page takes to decode the asset: the sum of `neededBytes` in
+    `parts.js` over all levels."""
+    return sum(
+        2000 * len(bricks) + (40 + 2 * grid.n_channels) * vertices.n
+        for grid in (asset.arrays.densities, asset.arrays.features)
+        for bricks, vertices in zip(grid.pyramid.levels, grid.pyramid.vertices, strict=True)
+    )
 
 
 def gpu_bytes(asset: Asset) -> int:

@@ -36,7 +36,7 @@ from typing import NamedTuple
 
 from player.asset.asset import Asset
 from player.errors import ConfigError
-from player.page.gpu_memory import MOST_CHANNELS, gpu_bytes
+from player.page.gpu_memory import MOST_CHANNELS, MOST_DECODING_BYTES, decoding_bytes, gpu_bytes
 from player.page.modules import joined, without_comments
 from player.page.poster import poster_bytes
 from player.page.scene_files import MANIFEST, scene_files
@@ -99,8 +99,8 @@ def page(
         n_threads, march: those of `player.render.render`, for the picture that the page shows at first.
 
     Raises:
-        ConfigError: the page takes more graphics memory, or the asset has more channels than browsers can
-            draw, or was opened without some of its parts.
+        ConfigError: the page takes more graphics memory, or more memory than browsers give a page, or the
+            asset has more channels than browsers can draw, or was opened without some of its parts.
         FormatError: a file of the asset is broken, or a part is missing.
         MissingExtraError: `march` is "numba", which is not installed or does not run here.
 
@@ -190,6 +190,12 @@ def _checked_gpu_bytes(asset: Asset, max_gpu_mb: int) -> int:
         raise ConfigError(
             f"{asset.folder}: channels: expected at most {MOST_CHANNELS}, which browsers can draw, got "
             f"{n_channels}: bake it with fewer (vfr-bake --n-channels)"
+        )
+    needed = decoding_bytes(asset)
+    if needed > MOST_DECODING_BYTES:
+        raise ConfigError(
+            f"{asset.folder}: memory to unpack the scene: expected at most {MOST_DECODING_BYTES / 1e6:.0f} "
+            f"MB, which browsers give a page, got {needed / 1e6:.0f} MB: bake it smaller (vfr-bake --preset)"
         )
     found = gpu_bytes(asset)
     if found > max_gpu_mb * 1_000_000:

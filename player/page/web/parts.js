@@ -4,7 +4,8 @@ import { Decoder, SYMBOL_OF_ZERO } from "./coder.js";
 import { Pyramid, putValues } from "./pyramid.js";
 import { decodeStructure } from "./structure.js";
 
-// The most bytes of memory that a scene may take while it is decoded: browsers end a page that asks for much more.
+// The most bytes of memory that a scene may take while it is decoded: browsers end a page that asks for much more. The twin
+// of MOST_DECODING_BYTES in player/page/gpu_memory.py.
 const MOST_BYTES = 3200e6;
 
 // One of the two pyramids, as far as its sections have been read. A level whose structure has not been read has no values,
@@ -158,7 +159,8 @@ export class PartsReader {
 }
 
 // Return the most bytes of memory that a level takes. The bytes per brick and per vertex are those of the arrays in this
-// module and in pyramid.js, including the rows of one level and the symbols of a section with all channels.
+// module and in pyramid.js, including the rows of one level and the symbols of a section with all channels. The twin of
+// `decoding_bytes` in player/page/gpu_memory.py.
 function neededBytes(structure, manifest) {
   const nChannels = structure.grid === "features" ? manifest.n_channels : 1;
   return 2000 * structure.n_bricks + (40 + 2 * nChannels) * structure.n_vertices;

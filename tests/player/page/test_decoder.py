@@ -20,6 +20,7 @@ from player.cameras.views import asset_cameras
 from player.errors import ConfigError, FormatError
 from player.head.head import asset_head
 from player.page import page
+from player.page.gpu_memory import MOST_DECODING_BYTES, decoding_bytes
 from player.page.scene_files import scene_files
 from tests.player.asset.test_asset import replace_file
 from tests.player.asset.test_parts import MANIFEST, STEPS, cells, stored
@@ -260,6 +261,8 @@ def test_numbers_that_take_too_much_memory_are_refused(
     for part in manifest["parts"]:
         for section in part["sections"]:
             if section["kind"] == "structure":
-                section["n_vertices"] = 1 << 30
+                section["n_vertices"] *= 1 << 20
+                section["n_bricks"] *= 1 << 20
     found = run(chromium, tmp_path, {**files, "manifest.json": json.dumps(manifest).encode()})
-    assert "MB of memory: expected at most" in found["error"]
+    needed, most = decoding_bytes(levels) << 20, MOST_DECODING_BYTES // 10**6
+    assert f"takes {-(-needed // 10**6)} MB of memory: expected at most {most} MB" in found["error"]

@@ -19,7 +19,7 @@ from exporters.options import ExportOptions
 from player.asset.asset import Asset
 from player.errors import ConfigError, FormatError
 from player.page import page
-from player.page.gpu_memory import MOST_CHANNELS, feature_bytes
+from player.page.gpu_memory import MOST_CHANNELS, decoding_bytes, feature_bytes
 from player.page.modules import joined
 from player.page.page import page_of_many_files, page_of_one_file, page_script, web_files
 from player.page.scene_files import scene_files
@@ -186,6 +186,19 @@ def test_more_graphics_memory_than_may_be_is_refused(asset: Asset, tmp_path: Pat
     with pytest.raises(ConfigError, match=r"expected at most 1 MB, got \d+ MB: bake it smaller"):
         export_asset(asset.folder, tmp_path / "scene.html", ExportOptions(max_gpu_mb=1))
     assert not list(tmp_path.iterdir())
+
+
+def test_more_memory_than_browsers_give_a_page_is_refused(
+    asset: Asset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    limits = page_of_one_file.__globals__
+    monkeypatch.setitem(limits, "MOST_DECODING_BYTES", decoding_bytes(asset))
+    for name in ("scene.html", "site"):
+        export_asset(asset.folder, tmp_path / name, ExportOptions(format=None if "." in name else "web"))
+    monkeypatch.setitem(limits, "MOST_DECODING_BYTES", decoding_bytes(asset) - 1)
+    for make in (page_of_one_file, page_of_many_files):
+        with pytest.raises(ConfigError, match=r"memory to unpack the scene: expected at most \d+ MB, which"):
+            make(asset)
 
 
 def test_more_channels_than_browsers_draw_are_refused(chromium: Browser, tmp_path: Path) -> None:
