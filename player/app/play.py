@@ -15,11 +15,13 @@ from typing import Any, NamedTuple
 from player.app.frame_files import Target, frame_key, unfinished, video_key
 from player.app.jobs import Done, Job, render_job
 from player.app.options import VIDEO, PlaySettings
+from player.app.video import MOST_VIDEO_SIDE
 from player.asset.asset import Asset
 from player.cameras.camera import Camera
 from player.errors import ConfigError
 from player.files.files import write_bytes
-from player.render import FRAME_BYTES, Renderer, check_size
+from player.files.images import MOST_WEBP_SIDE
+from player.render import FRAME_BYTES, MAX_PIXELS, Renderer, check_size
 
 LARGE_BYTES = 1e9
 """A line warns before a picture is rendered, or a video, that takes this many bytes of memory or more."""
@@ -27,6 +29,8 @@ MEMORY_BYTES = {".png": FRAME_BYTES, ".webp": 50, VIDEO: 240}
 """Most memory of a picture or a video while it is made, in bytes per pixel, by its suffix. WebP's encoder
 takes 38 to 44 besides the 8-bit picture, which is all that is left of the frame by then. That of H.264
 compares dozens of pictures: it takes 190 to 225 for a film of 60 or more."""
+MOST_SIDE = {".png": MAX_PIXELS, ".webp": MOST_WEBP_SIDE, VIDEO: MOST_VIDEO_SIDE}
+"""Most pixels along a side of a picture or a video, by its suffix. PNG allows more than are rendered."""
 
 Say = Callable[[str], object]
 Advance = Callable[[int, int, float], object]
@@ -66,8 +70,8 @@ def play(
             milliseconds that this one took.
 
     Raises:
-        ConfigError: no camera is chosen, a picture is too large, sizes differ in a video, or a resumed run
-            finds pictures or a video that show something else.
+        ConfigError: no camera is chosen, a picture is too large, or too large for its format, sizes differ in
+            a video, or a resumed run finds pictures or a video that show something else.
         MissingExtraError: a video without PyAV, a cluster without dask.distributed, or numba where it is
             asked for and does not run.
         OutputError: a file exists already, or cannot be written.
@@ -151,8 +155,14 @@ def _check_sizes(cameras: Sequence[Camera], target: Target, say: Say) -> None:
     sizes = sorted({(camera.width, camera.height) for camera in cameras})
     if target.is_video and len(sizes) > 1:
         raise ConfigError(f"{target.path}: expected views of one size for a video, got {sizes}: add --size")
-    width, height = max(sizes, key=math.prod)
     what, suffix = ("video", VIDEO) if target.is_video else ("picture", target.suffix)
+    width, height = max(sizes, key=max)
+    if max(width, height) > MOST_SIDE[suffix]:
+        raise ConfigError(
+            f"{target.path}: expected at most {MOST_SIDE[suffix]} pixels a side for {suffix}, "
+            f"got {width}x{height}: write PNG pictures"
+        )
+    width, height = max(sizes, key=math.prod)
     n_bytes = width * height * MEMORY_BYTES[suffix]
     if n_bytes >= LARGE_BYTES:
         say(f"a {what} of {width}x{height} takes {n_bytes / 1e9:.1f} GB of memory")

@@ -18,6 +18,9 @@ from player.files.images import KEY
 QUALITY = 18
 """x264's constant rate factor: 0 is lossless, 18 looks lossless, 23 is x264's default."""
 
+MOST_VIDEO_SIDE = 16384
+"""Most pixels along a side of a picture that x264 encodes."""
+
 
 def load_av() -> Any:
     """Import PyAV, which brings FFmpeg along. Raises MissingExtraError."""

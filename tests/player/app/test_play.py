@@ -148,7 +148,7 @@ def test_what_takes_much_memory_is_told_of(asset: Asset, name: str, what: str, n
     target = Target.of(PlaySettings(Path(name)))
     pixels = math.ceil(LARGE_BYTES / n_bytes)
     wide, square = (
-        small.resized(pixels // 100 + 1, 100),
+        small.resized(pixels // 2000 + 1, 2000),
         small.resized(math.isqrt(pixels) - 1, math.isqrt(pixels) - 1),
     )
     said: list[str] = []
@@ -157,8 +157,23 @@ def test_what_takes_much_memory_is_told_of(asset: Asset, name: str, what: str, n
     for cameras in [[wide]] if target.is_video else [[wide, small, square], [square, small, wide], [wide]]:
         said.clear()
         _check_sizes(cameras, target, said.append)
-        gigabytes = wide.width * 100 * n_bytes / 1e9
-        assert said == [f"a {what} of {wide.width}x100 takes {gigabytes:.1f} GB of memory"]
+        gigabytes = wide.width * 2000 * n_bytes / 1e9
+        assert said == [f"a {what} of {wide.width}x2000 takes {gigabytes:.1f} GB of memory"]
+
+
+@pytest.mark.parametrize(
+    ("name", "most"), [("a.webp", 16383), pytest.param("a.mp4", 16384, marks=pytest.mark.extra)]
+)
+def test_sides_too_long_for_a_format_are_refused_at_once(
+    name: str, most: int, asset: Asset, tmp_path: Path
+) -> None:
+    camera, settings = asset_cameras(asset)[0], PlaySettings(tmp_path / name, march="numpy")
+    for size in ((most + 1, 2), (2, most + 1)):
+        with pytest.raises(ConfigError, match=f"expected at most {most} pixels a side"):
+            play(asset, [camera.resized(*size)], settings)
+    assert not list(tmp_path.iterdir())
+    play(asset, [camera.resized(most, 2)], settings)
+    assert (tmp_path / name).exists()
 
 
 PEAK = """
