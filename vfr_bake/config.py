@@ -166,6 +166,7 @@ class DeviceSettings:
     max_rays: int = 16_384
     grid_rate: float = 1e-2
     network_rate: float = 4e-3
+    pilot_steps: int = 300
     distortion: float = 0.05
 
     def __post_init__(self) -> None:
@@ -175,6 +176,7 @@ class DeviceSettings:
         check(self, "max_rays", 1 <= self.max_rays <= 2**20, "1 to 1,048,576")
         check(self, "grid_rate", 0 < self.grid_rate < 1, "between 0 and 1")
         check(self, "network_rate", 0 < self.network_rate < 1, "between 0 and 1")
+        check(self, "pilot_steps", self.pilot_steps >= 0, "at least 0")
         check(self, "distortion", 0 <= self.distortion < 1e3, "0 to 1000")
 
 
@@ -239,9 +241,9 @@ class TrainConfig:
     """Adam learning rate of the hash grids; 0.01."""
     network_rate: float | None = None
     """Adam learning rate of the density network and the head; GPU 0.01, as in the paper, CPU 0.004."""
-    pilot_steps: int = 300
+    pilot_steps: int | None = None
     """First steps, in which a small pilot network renders colours sample by sample (section 3.3 of the
-    paper)."""
+    paper); 300, but no more than a quarter of the training."""
     step_cells: float = 3.0
     """Objects: length of a march step in training, in cells of the finest level; steps of pictures are half
     as long. Longer steps leave room for more rays in a batch: lego after 1,500 steps had 22.4 dB with 1.4
@@ -275,7 +277,6 @@ class TrainConfig:
         check(self, "effort", self.effort in get_args(Effort), f"one of {get_args(Effort)}")
         check(self, "device", self.device in get_args(Device), f"one of {get_args(Device)}")
         check(self, "minutes", self.minutes is None or self.minutes > 0, "more than 0")
-        check(self, "pilot_steps", self.pilot_steps >= 0, "at least 0")
         check(self, "step_cells", 0.1 <= self.step_cells <= 16, "0.1 to 16")
         check(self, "occupancy_resolution", 8 <= self.occupancy_resolution <= 512, "8 to 512")
         check(self, "near_gradients", 0 <= self.near_gradients < 1e3, "0 to 1000")

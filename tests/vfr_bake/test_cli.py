@@ -87,6 +87,7 @@ def test_the_help_names_the_defaults_that_hold(
         f"GPU {gpu.max_rays:,}, CPU {cpu.max_rays:,}.",
         f"GPU {gpu.network_rate:g}, as in the paper, CPU {cpu.network_rate:g}.",
         f"Adam learning rate of the hash grids; {cpu.grid_rate:g}.",
+        f"paper); {cpu.pilot_steps}, but no more than a quarter of the training.",
         f"objects {cpu.distortion:g}, within a hundredth of the box; scenes {scenes.distortion:g},",
         f"Seed of every random number. (default: {TrainConfig().seed})",
     ):

@@ -307,6 +307,12 @@ def _train_steps(trainer: Trainer, checkpoint: Path, preview: Preview | None) ->
                     told = True
                 saved = time.monotonic()
     interrupted = interrupted or ctrl_c.pressed  # after the last step
+    if n_steps and not trainer.head_learns and trainer.processes.first:
+        print(
+            "vfr-train: the training has ended in its first steps, which teach the pilot network alone: the "
+            "model shows random colours: train longer",
+            file=sys.stderr,
+        )
     if preview is not None:
         preview.write(trainer)
     return {

@@ -57,6 +57,9 @@ from vfr_bake.training.tensor_files import on_cpu
 
 SOLID = 0.9
 """A picture's exposure is judged by rays where the field's opacity and the photograph's alpha exceed this."""
+PILOT_SHARE = 0.25
+"""The pilot's steps end after this share of the training, unless their number was given: the head has to
+learn, too."""
 FAINT = 0.01
 """Samples whose gradient is shorter than this many root mean squares are skipped. They are four in ten and
 have a millionth of the sum of squares, but each would fetch as many table rows from memory as the others."""
@@ -118,6 +121,8 @@ class Trainer:
         """Number of the next step, and so the number of steps done."""
         self.seconds = 0.0
         """Training time so far, interruptions left out."""
+        self.head_learns = False
+        """Whether the last step taught the head, and not the pilot network."""
         self._generator = torch.Generator(self.device).manual_seed(config.seed)
         # A random background forces the field to be opaque where the pictures are (without alpha,
         # everywhere): against one fixed colour, a thin fog could give the same picture.
@@ -270,8 +275,9 @@ class Trainer:
     def _step(self, step: int, progress: float) -> tuple[float, int, int]:
         """Take one optimiser step. Return (loss, number of rays, number of samples) over all processes; the
         loss is NaN if the step was skipped."""
-        pilot = self._is_pilot(step)
-        batch, samples = self._next or self._sampled(step)
+        pilot = self._next is None and self._is_pilot(step, progress)
+        self.head_learns = not pilot
+        batch, samples = self._next or self._sampled(step, pilot)
         learned = self.effects.learned(batch.pictures, batch.places)
         n_learned = len(samples.rays) if learned is None else int(learned[samples.rays].sum())
         totals = self.processes.total(len(samples.rays), len(samples.t_mid), n_learned)
@@ -300,15 +306,16 @@ class Trainer:
                 self.effects.observe(seen, n_rays)
             return value, n_rays, n_samples
 
-    def _is_pilot(self, step: int) -> bool:
+    def _is_pilot(self, step: int, progress: float) -> bool:
         """Return whether the pilot network gives the colours of this step. Where colours are composited
         instead of features, the head needs no pilot."""
-        return step < self.config.pilot_steps and self._field.config.compositing == "features"
+        ended = step >= self.pace.pilot_steps or (self.config.pilot_steps is None and progress >= PILOT_SHARE)
+        return not ended and self._field.config.compositing == "features"
 
-    def _sampled(self, step: int) -> Sampled:
-        """Draw a batch for a step, and sample it in the field as it is now."""
+    def _sampled(self, step: int, pilot: bool = False) -> Sampled:
+        """Draw a batch for a step, which is one of the `pilot` or not, and sample it in the field as it is
+        now."""
         self._guide.prepare(step, self._field)
-        pilot = self._is_pilot(step)
         batch = self._draw(self._guide.n_rays(pilot))
         samples = self._guide.sample(
             self._field, batch.rays_o, batch.rays_d, batch.jitter, pilot, 1 / self.processes.size

@@ -95,6 +95,20 @@ def test_an_interrupted_training_goes_on(
     assert all(torch.equal(tensor, fields[1][name]) for name, tensor in fields[0].items())
 
 
+@pytest.mark.parametrize(("step", "says"), [(2, True), (6, False)])
+def test_a_training_that_ends_before_the_head_has_learned_says_so(
+    step: int,
+    says: bool,
+    small_data: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    press_in_step(step, 1, monkeypatch)
+    assert train_main([str(small_data), str(tmp_path / "model.pt"), *SMALL]) == 130
+    assert ("the model shows random colours: train longer" in capsys.readouterr().err) == says
+
+
 @pytest.mark.parametrize(("step", "times"), [(0, 1), (6, 2)])
 def test_ctrl_c_in_the_first_step_or_twice_ends_at_once(
     step: int,

@@ -114,6 +114,13 @@ def test_the_minutes_end_it(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> No
     assert [report.progress for report in reports] == [second / 30 for second in range(1, 30, 2)]
 
 
+@pytest.mark.parametrize(("given", "taken"), [(None, 10), (30, 30)])
+def test_the_pilot_leaves_a_short_training_to_the_head(scene: Scene, given: int | None, taken: int) -> None:
+    """It learns in a quarter of the training at most, unless its steps were asked for."""
+    trainer = Trainer(scene, config(steps=40, pilot_steps=given, batch_samples=1024))
+    assert [trainer.head_learns for _ in trainer.run()] == [False] * taken + [True] * (40 - taken)
+
+
 def test_minutes_leave_out_compiling_and_pauses(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     """The first step compiles for 20 seconds, and the machine sleeps for an hour after the third."""
     now = 0.0
