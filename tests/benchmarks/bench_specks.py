@@ -88,10 +88,10 @@ def models_own(model: Model, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
     """Return colours [h, w, 3] before they are mixed with the background, and opacity [h, w, 1], of a camera
     in the world's frame."""
     rays_o, rays_d = camera.transformed(np.linalg.inv(model.world_from_model)).rays()
-    features, opacity, _ = model.sampler.composited_features(model.field, rays_o, rays_d)
+    features, opacity = model.sampler.composited_features(model.field, rays_o, rays_d)
     hit = np.flatnonzero(opacity > 0)
     rgb = np.zeros((len(rays_o), 3), np.float32)
-    rgb[hit] = head_colours(model.field, features[hit], rays_d[hit])
+    rgb[hit] = head_colours(model.field.head, features[hit], rays_d[hit])
     return rgb.reshape(camera.height, camera.width, 3), opacity.reshape(camera.height, camera.width, 1)
 
 

@@ -9,6 +9,7 @@ places as the exported one; gradients pass as if nothing were rounded (straight-
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -19,9 +20,7 @@ from torch.nn.functional import gelu, hardswish
 from exporters.head.onnx_head import HeadWeights, Layer, Range, levels
 from player.head.graph import PAIR_LIMIT
 from vfr_bake.field.networks import HeadNetwork, SphericalHarmonics
-
-ROWS_AT_ONCE = 8192
-"""Rays whose colours are computed at a time."""
+from vfr_bake.rendering.render import head_colours
 
 
 def fold_head(head: HeadNetwork, first_layer: np.ndarray) -> HeadWeights:
@@ -178,17 +177,7 @@ def runner(
 ) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
     """Return the head as a function from composited features [n, n_channels] and unit directions [n, 3] to
     colours [n, 3]. With `ranges`, it computes in 8 bits."""
-    head = FoldedHead(weights, ranges=ranges)
-
-    @torch.no_grad()
-    def colours(features: np.ndarray, dirs: np.ndarray) -> np.ndarray:
-        rgb = np.empty((len(features), 3), np.float32)
-        for first in range(0, len(features), ROWS_AT_ONCE):
-            rows = slice(first, first + ROWS_AT_ONCE)
-            rgb[rows] = head(torch.from_numpy(features[rows]), torch.from_numpy(dirs[rows])).numpy()
-        return rgb
-
-    return colours
+    return partial(head_colours, FoldedHead(weights, ranges=ranges))
 
 
 def between(first: HeadWeights, second: HeadWeights, share: float) -> HeadWeights:

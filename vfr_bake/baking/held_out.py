@@ -182,7 +182,7 @@ class HeldOut:
         features, opacity = model.sampler.composited_features(model.field, self.rays_o, self.rays_d)
         self._hits = np.flatnonzero(opacity > 0)
         self._features, self._opacity = features[self._hits], opacity[self._hits, None]
-        self._field = model.field
+        self._head = model.field.head
         if not (self._opacity > MIN_OPACITY).any():
             raise TrainingError(
                 "model: expected something to see from its cameras, got nothing: train longer"
@@ -258,7 +258,7 @@ class HeldOut:
         return loss.db < 0 if measured else after.error < before.error
 
     def _colours(self, features: np.ndarray) -> np.ndarray:
-        return head_colours(self._field, features, self.rays_d[self._hits])
+        return head_colours(self._head, features, self.rays_d[self._hits])
 
     def channel_loss(self, kept: np.ndarray) -> Loss:
         """Return the loss if the model's own rendered features were multiplied by `kept` [n_channels,
@@ -272,7 +272,7 @@ class HeldOut:
         mean = np.zeros((len(self._hits), 3), np.float32)
         for _ in range(N_DIRECTIONS):
             others = self.rays_d[random.permutation(self._hits)]
-            mean += head_colours(self._field, self._features, others) / N_DIRECTIONS
+            mean += head_colours(self._head, self._features, others) / N_DIRECTIONS
         return self._loss_of_colours(mean)
 
     def _loss_of_colours(self, colours: np.ndarray) -> Loss:
@@ -286,7 +286,7 @@ class HeldOut:
         """Return the pictures that the model's own head makes of the rays' composited `features` [n,
         n_channels] and `opacity` [n]."""
         met = np.flatnonzero(opacity > 0)
-        colours = head_colours(self._field, features[met], self.rays_d[met])
+        colours = head_colours(self._head, features[met], self.rays_d[met])
         return self._compared(self._pictures(met, colours, opacity))
 
     def _pictures(self, hits: np.ndarray, colours: np.ndarray, opacity: np.ndarray) -> np.ndarray:

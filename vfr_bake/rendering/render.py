@@ -7,6 +7,7 @@ from typing import TypeAlias
 
 import numpy as np
 import torch
+from torch import nn
 
 from player.cameras.camera import Camera
 from vfr_bake.field.field import VfrField
@@ -30,12 +31,13 @@ grid, or a scene's proposals."""
 
 
 @torch.no_grad()
-def head_colours(field: VfrField, features: np.ndarray, dirs: np.ndarray) -> np.ndarray:
-    """Return the colours [n, 3] of composited `features` [n, n_channels] seen along unit `dirs` [n, 3]."""
+def head_colours(head: nn.Module, features: np.ndarray, dirs: np.ndarray) -> np.ndarray:
+    """Return the colours [n, 3] that `head` gives composited `features` [n, n_channels] seen along unit
+    `dirs` [n, 3]."""
     out = np.empty((len(features), 3), np.float32)
     for start in range(0, len(features), HEAD_CHUNK):
         rows = slice(start, start + HEAD_CHUNK)
-        out[rows] = field.head(torch.from_numpy(features[rows]), torch.from_numpy(dirs[rows])).numpy()
+        out[rows] = head(torch.from_numpy(features[rows]), torch.from_numpy(dirs[rows])).numpy()
     return out
 
 
@@ -82,7 +84,7 @@ def _colours_of_features(
     features, opacity = sampler.composited_features(field, rays_o, rays_d)
     colours = np.zeros((len(rays_o), 3), np.float32)
     hit = np.flatnonzero(opacity > 0)
-    colours[hit] = head_colours(field, features[hit], rays_d[hit]) * opacity[hit, None]
+    colours[hit] = head_colours(field.head, features[hit], rays_d[hit]) * opacity[hit, None]
     return colours, opacity
 
 

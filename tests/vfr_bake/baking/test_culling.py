@@ -130,7 +130,7 @@ def test_what_a_floor_loses_is_what_pictures_without_its_cells_lose(
             opacity[ray] = weights.sum()
         met = opacity > 0
         rgb = (1 - opacity[:, None]) * held_out.background
-        rgb[met] += opacity[met, None] * head_colours(model.field, features[met], held_out.rays_d[met])
+        rgb[met] += opacity[met, None] * head_colours(model.field.head, features[met], held_out.rays_d[met])
         return expected_loss(float(np.mean((rgb - held_out.wanted) ** 2)), 30.0)
 
     expected = loss(visible) - loss(occupied_cells(model, 96))

@@ -141,7 +141,7 @@ def test_photographed_rays_show_the_mean_of_photographs_and_model(model: Model) 
         camera = model.cameras[view].transformed(np.linalg.inv(model.world_from_model))
         origins, directions = camera.rays_through(rows[view])
         features, opacity = model.sampler.composited_features(model.field, origins, directions)
-        colours = head_colours(model.field, features, directions) * opacity[:, None]
+        colours = head_colours(model.field.head, features, directions) * opacity[:, None]
         of_view = views == view
         np.testing.assert_allclose(rays.rays_o[of_view], origins, atol=1e-6)
         np.testing.assert_allclose(rays.rays_d[of_view], directions, atol=1e-6)
