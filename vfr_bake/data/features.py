@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from player.progress import Progress
 from vfr_bake.data.files.pictures import opencv, shrunk
 
 MAX_SIDE = 1600
@@ -99,13 +100,15 @@ def match(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.stack([kept, nearest[kept]], axis=-1).astype(np.uint32)
 
 
-def pairs_to_match(features: Sequence[Features]) -> list[tuple[int, int]]:
+def pairs_to_match(features: Sequence[Features], progress: Progress) -> list[tuple[int, int]]:
     """Return the pairs (i, j), i < j, of pictures that are worth matching.
 
     Each picture is paired with the `N_PARTNERS` that share most of its largest features (preemptive matching:
     Wu, Towards linear-time incremental structure from motion, 3DV 2013). This finds where a walk comes back
     to its beginning, and what pictures in no order have in common. Each picture is also paired with its
-    neighbours in the sequence, which in a video overlap even where no large features are seen.
+    neighbours in the sequence, which in a video overlap even where no large features are seen. `progress`:
+    called with the number of pairs that have been compared, and of all; the time grows with their number, and
+    so with the square of the number of pictures.
     """
     n = len(features)
     coarse = np.zeros((n, N_COARSE, 128), np.float32)
@@ -115,6 +118,7 @@ def pairs_to_match(features: Sequence[Features]) -> list[tuple[int, int]]:
     shared = np.zeros((n, n), np.int64)
     for i in range(n - 1):
         shared[i, i + 1 :] = _n_matches(coarse[i], coarse[i + 1 :])
+        progress((i + 1) * (2 * n - i - 2) // 2, n * (n - 1) // 2)
     shared += shared.T
     near = np.abs(np.subtract.outer(np.arange(n), np.arange(n))) <= N_NEIGHBOURS
     chosen = near.copy()

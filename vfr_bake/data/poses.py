@@ -141,10 +141,10 @@ def estimate_cameras(
     frames are first written to `<stem>_frames/images/` beside it. A `sparse/0` that exists is reported and
     left as it is; a new one appears when it is complete. `progress`: called with the name of a stage, the
     number of its items that are done, and the number of all. The stages are `frames` for a video, then
-    `features`, `matches` and `cameras`; then `cameras, attempt 2` and so on if too few of a handful of
-    pictures were placed; then `walk`, `turns` and `cameras again` if the model is folded. `say`: called with
-    a sentence if the folder has cameras of a form that is not read or masks of no picture, if a video can
-    be read in part only, and if the disk refuses to keep features and matches until the end.
+    `features`, `pairs`, `matches` and `cameras`; then `cameras, attempt 2` and so on if too few of a handful
+    of pictures were placed; then `walk`, `turns` and `cameras again` if the model is folded. `say`: called
+    with a sentence if the folder has cameras of a form that is not read or masks of no picture, if a video
+    can be read in part only, and if the disk refuses to keep features and matches until the end.
 
     Pictures are turned upright as EXIF says. Those that show what another one shows are left out
     (`vfr_bake.data.files.repeats`). Pictures of one size, and of one maker, model and focal length where EXIF
@@ -199,7 +199,7 @@ def estimate_cameras(
     pairs = match_pictures(
         sensors,
         features,
-        pairs_to_match(features),
+        pairs_to_match(features, lambda done, of: progress("pairs", done, of)),
         lambda done, of: progress("matches", done, of),
         lambda i, j: known.matches(stamps[i], stamps[j], len(features[i].points), len(features[j].points)),
         lambda i, j, matches: known.keep_matches(stamps[i], stamps[j], matches),

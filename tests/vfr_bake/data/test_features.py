@@ -57,9 +57,12 @@ def test_a_walk_is_closed_without_all_pairs():
     strip = np.concatenate([strip, strip[:, :200]], axis=1)
     views = [strip[:, start : start + 160] for start in np.linspace(0, 1600, 60, endpoint=False).astype(int)]
     opaque = np.full((120, 160), 255, np.uint8)
-    pairs = pairs_to_match([find_features(np.dstack([view, opaque])) for view in views])
+    calls: list[tuple[int, int]] = []
+    features = [find_features(np.dstack([view, opaque])) for view in views]
+    pairs = pairs_to_match(features, lambda *call: calls.append(call))
     assert (0, 59) in pairs and (0, 1) in pairs and len(pairs) < 60 * 59 / 4
     assert len(set(pairs)) == len(pairs) and all(i < j for i, j in pairs)
+    assert calls[:2] == [(59, 1770), (59 + 58, 1770)] and calls[-1] == (1770, 1770)
 
 
 def test_one_camera_for_one_device_and_its_focal_length(tmp_path: Path):

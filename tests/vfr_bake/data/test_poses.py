@@ -116,7 +116,7 @@ def test_the_report_is_what_colmap_says_of_its_model(can):
 def test_progress_goes_forward_to_the_end_of_every_stage(can):
     _, _, calls = can
     stages = list(dict.fromkeys(stage for stage, _, _ in calls))
-    assert stages == ["features", "matches", "cameras"]
+    assert stages == ["features", "pairs", "matches", "cameras"]
     for stage in stages:
         counts = [(done, of) for name, done, of in calls if name == stage]
         assert counts == sorted(counts) and counts[-1][0] == counts[-1][1]
@@ -158,7 +158,7 @@ def test_text_beside_a_model_does_not_matter(can, tmp_path: Path):
     assert estimate_cameras(tmp_path / "a", quiet).n_registered == N_CAN
 
 
-@pytest.mark.parametrize("where", ["features", "matches", "cameras"])
+@pytest.mark.parametrize("where", ["features", "pairs", "matches", "cameras"])
 def test_interruption_leaves_nothing(can, tmp_path: Path, where: str):
     for path in sorted(can[0].glob("*.jpg"))[:4]:
         shutil.copy(path, tmp_path)
