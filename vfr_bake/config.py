@@ -344,7 +344,7 @@ class BakeConfig:
     """Width of a smaller head, which learns from the model's own; 0 keeps that one."""
     head_bits: int | None = None
     """Bits of the head's wide layers, 8 or 32 (float32): 8 play about twice as fast, and stay only where they
-    lose no more than the preset allows."""
+    lose no more than the preset allows, or where --target-ms limits the time of a frame."""
     refine_steps: int | None = None
     """Steps of each round in which head and stored values are adapted to each other, to show what photographs
     and the full model show; 0: none, with the model's own head. If not given, the preset's, or as many as

@@ -219,11 +219,16 @@ class Tuning:
         """Return `tuned`; or `stored`, with its head in float32, if 8 bits lose too much even after
         training."""
         lost = self._held_out.lost(self._in_float32.shown, self.kept.shown)
-        if self.ranges is None or lost.most <= BITS_SHARE * self._choice.target_loss_db:
+        if self.ranges is None or not self._is_too_much(lost.most):
             return tuned
         self.ranges, self.kept = None, self._in_float32
         self.left_out["head bits"] = f"none: with 8 bits the head would lose {lost}"
         return stored
+
+    def _is_too_much(self, lost_db: float) -> bool:
+        """Return whether 8 bits lose too much. A bake that has to reach a frame time keeps them, because its
+        head and lookups are those whose frames are fast enough in 8 bits."""
+        return self._config.target_ms is None and lost_db > BITS_SHARE * self._choice.target_loss_db
 
     def _refined_at_k(
         self,
@@ -297,7 +302,7 @@ class Tuning:
         ranges = activation_ranges(stored.head, rays.composed(stored.features)[0], rays.teacher.rays_d)
         after = self._held_out.measure("head in 8 bits", grid, runner(stored.head, ranges), self.n_fetches)
         lost = self._held_out.lost(before.shown, after.shown)
-        if lost.most * ROUNDING_LEFT > BITS_SHARE * self._choice.target_loss_db:
+        if self._is_too_much(lost.most * ROUNDING_LEFT):
             self.left_out["head bits"] = f"none: with 8 bits the head would lose {lost}"
             return before
         self.ranges = ranges

@@ -46,10 +46,11 @@ from vfr_bake.baking.plan import (
     is_compiled,
     make_plan,
 )
-from vfr_bake.baking.refinement import BATCH, HEAD_BATCH, HEAD_SHARE, Stored
+from vfr_bake.baking.refinement import BATCH, HEAD_BATCH, HEAD_SHARE, Stored, Tuning
 from vfr_bake.config import BakeConfig
 from vfr_bake.kernels import SOURCES
 from vfr_bake.presets import PRESETS, Preset
+from vfr_bake.training.length.witness_loss import Loss
 from vfr_bake.training.model_file import Model
 
 SMALL: dict[str, Any] = {
@@ -105,6 +106,21 @@ def test_a_frame_that_takes_too_long_is_an_error_and_writes_nothing(
     with pytest.raises(TrainingError, match=r"bake: time: expected at most 5 ms, got 9\.00 ms"):
         bake(model, tmp_path / "asset", BakeConfig(target_ms=5, **SMALL), silent)
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("target_ms", [None, 50.0])
+def test_a_head_that_was_timed_in_8_bits_keeps_them(
+    target_ms: float | None, model: Model, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It keeps them however much they lose: in float32, frames would take longer than was asked for."""
+    config = BakeConfig(target_ms=target_ms, **SMALL)
+    work = _Bake(model, config, silent)
+    layout, _ = work._cells()
+    stored, teacher, again = work._store(layout, 20_000)
+    monkeypatch.setattr(work.held_out, "lost", lambda before, after: Loss(9.0, 0.0))
+    tuning = Tuning(config, work.choice, work.held_out, lambda name: lambda done, of: None, 60.0)
+    tuning.run(stored, layout, teacher, again)
+    assert (tuning.ranges is None) == (target_ms is None)
 
 
 def test_time_that_is_left_changes_nothing(model: Model, tmp_path: Path) -> None:
