@@ -136,7 +136,7 @@ def _add_shapes(group: argparse._ArgumentGroup) -> None:
     value, add = partial(_value, group), group.add_argument
     value("--crop", "X,Y,Z,W,D,H[,YAW]", "only what is in this box of the world; or a .json file")
     faces, lods, texels, cloud = (whole(example=n) for n in (100000, 3, 2048, 200000))
-    value("--faces", "N", "simplify the mesh to N faces, or as few as can be reached", type=faces)
+    value("--faces", "N", "simplify the mesh to at most N faces", type=faces)
     value("--lods", "N", "levels of detail: N files, each of half the faces of the last", type=lods)
     add(
         "--method", choices=get_args(Method), help="the baked mesh; marching cubes in all voxels; fused depth"
@@ -179,7 +179,7 @@ def _sentence(summary: dict[str, Any]) -> str:
     if summary.get("frame", "world") != "world":
         parts.append(f"written in the frame {summary['frame']}")
     if summary.get("faces", 0) > summary.get("faces_asked", float("inf")):
-        parts.append(f"{summary['faces_asked']} were asked for, but no other edge can go without a fold")
+        parts.append(f"{summary['faces_asked']} were asked for, but fewer would leave nothing of the shape")
     if "texture" in summary:
         parts.append(f"texture {summary['texture']} x {summary['texture']}")
     for level in summary.get("lods", [])[1:]:

@@ -82,7 +82,7 @@ class ExportOptions:
     level: float | None = None
     """Density of the surface, 1/model unit; given, the surface is made again."""
     faces: int | None = None
-    """Faces of the mesh, or as few as can be reached; None keeps them."""
+    """The most faces of the mesh; None keeps them."""
     lods: int | None = None
     """Levels of detail, each a file with half the faces of the one before; None is one."""
     texture: int | None = None

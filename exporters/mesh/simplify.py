@@ -3,11 +3,12 @@ keeps colours and normals.
 
 Open3D averages the colours and normals of the two ends of each edge that it collapses. It does not know
 alpha, which is taken from the nearest vertex of the source. It stops early where collapsing any edge that is
-left would fold the surface, so a mesh with many thin parts keeps more faces than were asked for (lego,
-380,541 faces: a target of 20,000 is reached, one of 5,000 leaves 11,721). The command then says so.
+left would fold the surface, as in a mesh of many thin parts (lego, 380,541 faces: a target of 20,000 is
+reached, one of 5,000 leaves 11,721). Vertices in the same small cube are then merged, and edges are collapsed
+again, with larger and larger cubes, until there are as few faces as were asked for.
 
-Edge collapse takes minutes for millions of faces. A mesh that large is first clustered: vertices in the same
-small cube are merged, until about FIRST times the faces that are asked for are left.
+Edge collapse takes minutes for millions of faces. A mesh that large is merged in cubes first, until about
+FIRST times the faces that are asked for are left.
 """
 
 from __future__ import annotations
@@ -16,17 +17,22 @@ import numpy as np
 
 from exporters.extras import needs, require_open3d
 from exporters.shapes.mesh import TriangleMesh, has_three_corners, unit_normals
-from player.errors import ConfigError, DataError
+from player.errors import ConfigError
 from player.files.images import to_8_bit
 
 FIRST = 12
 """Edges are collapsed from about this many times the faces that are asked for; a mesh of more than twice as
-many is clustered first."""
+many is merged in cubes first."""
+LEAST_FIRST = 12_000
+"""Edges are collapsed from at least about this many faces: in the cubes that leave fewer, small parts vanish.
+"""
+LEAST = 4
+"""Faces of the smallest closed surface. Where fewer are asked for, Open3D may leave nothing."""
 
 
 def simplify_mesh(mesh: TriangleMesh, n_faces: int) -> TriangleMesh:
-    """Return the mesh with `n_faces` faces, or as few as can be reached; a mesh that has no more is returned
-    itself. The same mesh gives the same result.
+    """Return the mesh with at most `n_faces` faces, or with the fewest that were reached before nothing was
+    left; a mesh that has no more is returned itself. The same mesh gives the same result.
 
     Args:
         mesh: any mesh; parts that are not connected are simplified together.
@@ -34,7 +40,6 @@ def simplify_mesh(mesh: TriangleMesh, n_faces: int) -> TriangleMesh:
 
     Raises:
         ConfigError: `n_faces` below 1.
-        DataError: nothing is left of the mesh.
         MissingExtraError: Open3D is not installed.
 
     >>> empty = TriangleMesh(np.zeros((0, 3)), np.zeros((0, 3), np.int32), np.zeros((0, 3)),
@@ -44,8 +49,20 @@ def simplify_mesh(mesh: TriangleMesh, n_faces: int) -> TriangleMesh:
     """
     if n_faces < 1:
         raise ConfigError(f"--faces: expected 1 or more, got {n_faces}")
-    if len(mesh.faces) <= n_faces:
-        return mesh
+    cube, first = 0.0, max(FIRST * n_faces, LEAST_FIRST)
+    if len(mesh.faces) > 2 * first:
+        cube = mean_edge(mesh.vertices, mesh.faces) * (len(mesh.faces) / first) ** 0.5
+    while len(mesh.faces) > n_faces:
+        few = _collapsed(mesh, max(n_faces, LEAST), cube)
+        if not len(few.faces):
+            break
+        mesh, cube = few, max(1.2 * cube, mean_edge(few.vertices, few.faces))
+    return mesh
+
+
+def _collapsed(mesh: TriangleMesh, n_faces: int, cube: float) -> TriangleMesh:
+    """Return the mesh after vertices in the same cube of edge `cube` were merged, unless that is 0, and edges
+    were collapsed until `n_faces` faces are left or no other can be."""
     open3d = require_open3d("--faces")
     # Quadrics have products of coordinates, which lose their digits far from the origin.
     middle = mesh.bounds.astype(np.float64).mean(axis=0)
@@ -55,18 +72,12 @@ def simplify_mesh(mesh: TriangleMesh, n_faces: int) -> TriangleMesh:
     )
     source.vertex_normals = open3d.utility.Vector3dVector(np.ascontiguousarray(mesh.normals, np.float64))
     source.vertex_colors = open3d.utility.Vector3dVector(mesh.colours[:, :3] / 255)
-    if len(mesh.faces) > 2 * FIRST * n_faces:
-        edge = mean_edge(mesh.vertices, mesh.faces)
+    if cube:
         average = open3d.geometry.SimplificationContraction.Average
-        source = source.simplify_vertex_clustering(
-            edge * (len(mesh.faces) / (FIRST * n_faces)) ** 0.5, average
-        )
+        source = source.simplify_vertex_clustering(cube, average)
     result = source.simplify_quadric_decimation(n_faces)
-    faces = np.asarray(result.triangles, np.int32)
-    whole = has_three_corners(faces)
-    if not whole.any():
-        raise DataError(f"--faces: expected something left of {len(mesh.faces)} faces at {n_faces}, got none")
-    used, numbers = np.unique(faces[whole], return_inverse=True)
+    faces = np.asarray(result.triangles, np.int32).reshape(-1, 3)
+    used, numbers = np.unique(faces[has_three_corners(faces)], return_inverse=True)
     vertices = np.asarray(result.vertices)[used] + middle
     faces = numbers.reshape(-1, 3).astype(np.int32)
     colours = np.empty((len(used), 4), np.uint8)

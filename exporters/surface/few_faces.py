@@ -9,11 +9,9 @@ limits the number of faces.
 
 from __future__ import annotations
 
-import numpy as np
-
 from exporters.formats.ply import small_ply_size
 from exporters.mesh.simplify import clustered, mean_edge, simplify_mesh
-from exporters.shapes.mesh import TriangleMesh, unit_normals
+from exporters.shapes.mesh import TriangleMesh
 from exporters.surface.asset_surface import AssetSurface, Removed
 from exporters.surface.marching_cubes import BLOCK, Cut, cut_surface, settled
 from player.asset.grid import SparseGrid
@@ -86,25 +84,16 @@ def _thinned(cut: Cut, n_faces: float) -> Cut:
 def _within(mesh: TriangleMesh, n_faces: int, max_bytes: int | None) -> TriangleMesh:
     """Return a white mesh reduced to at most `n_faces` faces and at most `max_bytes`.
 
-    Where edges cannot be collapsed that far, as in a surface of many small parts, vertices are merged in
-    larger and larger cubes. Raises DataError: nothing is left.
+    Raises DataError: so few faces cannot be reached.
     """
-    cube = 0.0
     while True:
-        mesh = simplify_mesh(mesh, n_faces)
+        mesh = simplify_mesh(mesh, max(n_faces, 1))
         if len(mesh.faces) > n_faces:
-            cube = max(1.2 * cube, mean_edge(mesh.vertices, mesh.faces))
-            vertices, faces = clustered(mesh.vertices, mesh.faces, cube)
-            if not len(faces):
-                raise DataError(f"surface: expected one that fits into {n_faces} faces, got specks alone")
-            white = np.full((len(vertices), 4), 255, np.uint8)
-            normals = unit_normals(np.zeros(vertices.shape), vertices, faces)
-            mesh = TriangleMesh(vertices, faces, normals, white)
-        elif max_bytes is not None and _is_larger(mesh, max_bytes):
-            size = small_ply_size(len(mesh.vertices), len(mesh.faces))
-            n_faces = max(int(0.99 * len(mesh.faces) * max_bytes / size), 1)
-        else:
+            raise DataError(f"surface: expected one that fits into {n_faces} faces, got specks alone")
+        if max_bytes is None or not _is_larger(mesh, max_bytes):
             return mesh
+        size = small_ply_size(len(mesh.vertices), len(mesh.faces))
+        n_faces = int(0.99 * len(mesh.faces) * max_bytes / size)
 
 
 def _is_larger(mesh: TriangleMesh, max_bytes: int | None) -> bool:

@@ -19,7 +19,7 @@ from player.asset.bricks import pack_vertices
 from player.asset.manifest import Manifest
 from player.cameras.camera import Camera
 from player.cameras.transforms import write_cameras
-from tests.exporters.meshes import read_ply, tetrahedron
+from tests.exporters.meshes import random_mesh, read_ply, sphere, tetrahedron
 from tests.vertex_grids import arrays_of
 
 # The asset's mesh is in the world frame already; an exporter that applied this again would be far off.
@@ -67,6 +67,29 @@ def test_writes_world_coordinates(asset: Path, tmp_path: Path, capsys: pytest.Ca
     output = capsys.readouterr()
     assert output.out.startswith(f"{target}: 4 vertices, 4 faces, ") and output.err == ""
     assert "bounds (0, 0, 0) to (1, 2, 3)" in output.out
+
+
+@pytest.mark.needs("open3d")
+def test_levels_of_detail_where_no_edge_can_be_collapsed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    asset = write_small_asset(tmp_path / "asset", ply_bytes(random_mesh(60, 100)))
+    asked = ["--method", "baked", "--lods", "3", "--json"]
+    assert cli.main([str(asset), str(tmp_path / "mesh.ply"), *asked]) == 0
+    faces = [level["faces"] for level in json.loads(capsys.readouterr().out)["lods"]]
+    assert faces[0] == 100 and faces[1] <= 50 and 0 < faces[2] <= faces[1] // 2
+
+
+@pytest.mark.needs("open3d")
+def test_fewer_faces_than_a_closed_surface_has(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    asset = write_small_asset(tmp_path / "asset", ply_bytes(sphere(20)))
+    asked = [str(asset), str(tmp_path / "mesh.ply"), "--method", "baked", "--force", "--faces"]
+    assert cli.main([*asked, "4"]) == 0
+    assert "were asked for" not in capsys.readouterr().out
+    assert cli.main([*asked, "1"]) == 0
+    output = capsys.readouterr().out
+    assert " 4 faces, " in output
+    assert "1 were asked for, but fewer would leave nothing of the shape" in output
 
 
 def test_glb_is_y_up_and_json_is_one_line(

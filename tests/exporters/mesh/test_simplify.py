@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from exporters.mesh.simplify import simplify_mesh
-from exporters.shapes.mesh import crossed_edges
+from exporters.shapes.mesh import TriangleMesh, crossed_edges
 from player.errors import ConfigError, MissingExtraError
-from tests.exporters.meshes import box, sphere
+from tests.exporters.meshes import box, random_mesh, sphere
 
 
 @pytest.mark.needs("open3d")
@@ -58,6 +58,21 @@ def test_alpha_is_that_of_the_nearest_vertex() -> None:
     few = simplify_mesh(replace(mesh, colours=colours), 300)
     clear = np.abs(few.vertices[:, 2]) > 0.15
     assert np.array_equal(few.colours[clear, 3], np.where(few.vertices[clear, 2] > 0, 255, 100))
+
+
+@pytest.mark.needs("open3d")
+@pytest.mark.parametrize("n_faces", [50, 20, 5])
+def test_where_no_edge_can_be_collapsed_vertices_are_merged(n_faces: int) -> None:
+    """Edge collapse alone leaves 59 of the faces of this mesh, all of which cross each other."""
+    few = simplify_mesh(random_mesh(60, 100), n_faces)
+    assert 0 < len(few.faces) <= n_faces
+    assert np.array_equal(np.unique(few.faces), np.arange(len(few.vertices)))
+
+
+@pytest.mark.needs("open3d")
+@pytest.mark.parametrize("mesh", [box((0, 0, 0), (1, 1, 1)), sphere(20), sphere(120)])
+def test_something_is_left_of_a_closed_surface_of_one_face(mesh: TriangleMesh) -> None:
+    assert 0 < len(simplify_mesh(mesh, 1).faces) <= 4
 
 
 def test_enough_already_and_too_few() -> None:
