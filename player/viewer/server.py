@@ -31,7 +31,7 @@ from player.render import (
     checked_samples,
 )
 from player.terminal import command_line, printable
-from player.viewer.growing import Growing, tell_what_is_missing
+from player.viewer.growing import grow, tell_what_is_missing
 from player.viewer.pages import NO_PAGES, Pages
 from player.viewer.window import PictureChoices, Window
 
@@ -121,7 +121,7 @@ def serve(
         title = f"{printable(firsts[0].folder.resolve().name)} - vfr-play"
         server = guarded_server(settings.host, port, title, pages)
         windows: dict[int, Window] = {}
-        growing = None
+        stopped = threading.Event()
         try:
             windows = open_windows(server, renderers, settings)
 
@@ -134,11 +134,11 @@ def serve(
                 for renderer, asset in zip(renderers, given, strict=True)
                 if not isinstance(asset, Asset)
             ]
-            growing = Growing(later, changed, say)
+            reading = (later, changed, say, stopped)
+            threading.Thread(target=grow, args=reading, name="vfr-read", daemon=True).start()
             yield f"http://{_shown(settings.host)}:{server.get_port()}"
         finally:
-            if growing is not None:
-                growing.stop()
+            stopped.set()
             for window in list(windows.values()):
                 window.close()
             pages.close()

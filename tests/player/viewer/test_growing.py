@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import threading
 import time
 from collections.abc import Iterator
@@ -13,8 +12,8 @@ import pytest
 
 from player.asset.asset import Asset
 from player.errors import FormatError
-from player.render import Frame, Renderer
-from player.viewer.growing import Growing
+from player.render import Renderer
+from player.viewer.growing import grow
 from player.viewer.server import ServeSettings, serve
 from tests.player.in_parts import write_in_parts
 from tests.player.viewer.viewer_client import SECONDS, Client, Server
@@ -46,29 +45,26 @@ def test_a_renderer_goes_on_with_more_parts_and_keeps_pictures_that_have_begun(f
 
 
 def test_it_shows_what_there_is_and_tells_of_every_part(folder: Path) -> None:
-    """The picture shows the parts that were read so far. The reader is stopped before each part."""
-    n = len(Asset.open(folder).manifest.parts)
-    may_go_on, seen, said = threading.Semaphore(0), [], []
-
-    def slowly(parts: Iterator[Asset]) -> Iterator[Asset]:
-        for asset in parts:
-            assert may_go_on.acquire(timeout=SECONDS)
-            yield asset
-
-    parts = Asset.growing(folder)
-    changed = threading.Semaphore(0)
+    """The picture shows the parts that were read so far."""
+    parts, seen, said = Asset.growing(folder), [], []
     with Renderer(next(parts), 1, "numpy") as renderer:
-        Growing([(renderer, slowly(parts))], changed.release, said.append)
-        for number in itertools.count(1):
-            frame: Frame = renderer.render(small_view())
-            seen.append(frame.rgb)
-            if number == n:
-                break
-            may_go_on.release()
-            assert changed.acquire(timeout=SECONDS)
+
+        def look() -> None:
+            seen.append(renderer.render(small_view()).rgb)
+
+        look()
+        grow([(renderer, parts)], look, said.append, threading.Event())
+    assert len(seen) == len(Asset.open(folder).manifest.parts)
     for number, rgb in enumerate(seen, start=1):
         assert np.array_equal(rgb, picture(Asset.open(folder, parts=number)))
     assert said == []
+
+
+def test_nothing_more_is_shown_once_it_is_stopped(folder: Path) -> None:
+    parts, stopped = Asset.growing(folder), threading.Event()
+    with Renderer(next(parts), 1, "numpy") as renderer:
+        grow([(renderer, parts)], stopped.set, print, stopped)
+        assert renderer.asset.n_parts == 2
 
 
 def test_what_cannot_be_read_is_one_line_and_the_rest_is_shown(folder: Path) -> None:
@@ -77,15 +73,8 @@ def test_what_cannot_be_read_is_one_line_and_the_rest_is_shown(folder: Path) -> 
         raise FormatError("part_2.bin: expected 3 bytes, got 2")
 
     said: list[str] = []
-    told = threading.Event()
-
-    def say(text: str) -> None:
-        said.append(text)
-        told.set()
-
     with Renderer(Asset.open(folder, parts=1), 1, "numpy") as renderer:
-        Growing([(renderer, breaks())], lambda: None, say)
-        assert told.wait(SECONDS)
+        grow([(renderer, breaks())], lambda: None, said.append, threading.Event())
         assert renderer.asset.n_parts == 2
     assert said == ["warning: part_2.bin: expected 3 bytes, got 2: shown as its first 2 parts have it"]
 
