@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -17,7 +20,9 @@ from player.asset.density import decode_density, encode_density
 from player.asset.grid import MAX_DISTANCE, build_grid
 from player.asset.pyramid import Pyramid
 from player.asset.single_level import VertexBricks, from_vertices
+from player.march.fetches import stored_features
 from tests.numerics.bounds import Row
+from tests.player.in_parts import write_in_parts
 
 DENSITY = Row(
     "Density and optical depth", "density (player)", "exp(-80) to exp(80), 8 bits of the logarithm", 3e-5,
@@ -155,3 +160,22 @@ def test_grid_of_the_asset_keeps_every_vertex(asset: Asset) -> None:
     stored = asset.arrays.features
     assert stored.pyramid.vertices[0].n == len(asset.grid.features)
     assert (asset.grid.features == stored.values[0]).all()
+
+
+def test_features_are_read_as_the_format_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The grid gives the features that the reader in docs/format.md does, also where no level has a brick."""
+    monkeypatch.chdir(tmp_path)
+    asset = Asset.open(write_in_parts(Path("out")))
+    text = (Path(__file__).parents[3] / "docs" / "format.md").read_text(encoding="utf-8")
+    reader = text.split("## A reader")[1].split("```python\n")[1].split("\nframe = ")[0]  # it renders nothing
+    names: dict[str, Any] = {}
+    exec(compile(reader, "docs/format.md", "exec"), names)
+    (low, high), m = np.array(asset.manifest.aabb), asset.manifest
+    bare = 0
+    for share in np.random.default_rng(0).uniform(0, 1, (2000, 3)):
+        place = low + share * (high - low)
+        values, (total,) = stored_features(asset.grid, (share[:, None] * m.resolution).astype(np.float32))
+        value, wanted = names["feature"](place)
+        assert abs(total - wanted) < 1e-4 and np.abs(values[0] - value * wanted).max() < 1e-2, share
+        bare += names["read"](names["features"], m.feature_resolution, place)[0] is None
+    assert bare > 20
