@@ -61,6 +61,20 @@ def test_a_full_hull_keeps_the_first_box():
     assert scene_box(cameras)[1] == scene_box(cameras, np.full((10, 32, 32), 1, np.uint8))[1]
 
 
+@pytest.mark.parametrize("n_left", [0, 1])
+def test_pictures_that_were_cut_out_badly_do_not_crop_the_box(n_left: int):
+    """Two pictures of 30 change nothing in which all of the ball was cut away, or half of it."""
+    cameras = demo_cameras(96, 30)
+    masks = sphere_masks(cameras, np.array([0.55, -0.3, 0.1]), 0.3)
+    centre, half = scene_box(cameras, masks)
+    for number in (3, 11):
+        columns = np.flatnonzero(masks[number].any(axis=0))
+        masks[number, :, columns[n_left * len(columns) // 2] :] = 0
+    found_centre, found_half = scene_box(cameras, masks)
+    np.testing.assert_allclose(found_centre, centre, atol=0.02)
+    assert found_half == pytest.approx(half, abs=0.02)
+
+
 def test_one_camera_that_stands_still():
     centre, half = scene_box(demo_cameras(8, 1) * 2)
     assert np.isfinite(centre).all() and half > 0
