@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -298,6 +299,14 @@ def test_pictures_are_as_large_as_thirty_a_second_allow(
         assert sizes[-1][0] <= np.prod(sharp) <= np.prod(whole) <= 1600 * 1200
         assert rate < 1e6 or whole == [1600, 1200]
     assert page.evaluate(PACED, [2e4, 30, 1600, 1200, 60])[3], "a device that is far too slow"
+
+
+def test_a_still_picture_has_as_many_pixels_as_the_manual_says(page: Page) -> None:
+    manual = (Path(__file__).parents[3] / "docs" / "page.md").read_text(encoding="utf-8")
+    (millions,) = re.findall(r"every pixel of the screen, but at most ([\d.]+) million pixels", manual)
+    for width, height in ((3840, 2160), (6016, 3384)):
+        whole = page.evaluate(PACED, [1e10, 60, width, height, 60])[2]
+        assert np.prod(whole) == pytest.approx(float(millions) * 1e6, rel=1e-2)
 
 
 HASHES: dict[str, dict[str, Any]] = {
