@@ -160,6 +160,8 @@ def _add_pictures(group: argparse._ArgumentGroup) -> None:
 
 
 def _sentence(summary: dict[str, Any]) -> str:
+    from exporters.shapes.crop import corners_text  # imported late, because `--help` needs no numpy
+
     names = ("pictures", "cameras", "vertices", "faces", "points", "voxels")
     counts = [f"{summary[name]} {name}" for name in names if name in summary]
     if "channels" in summary:
@@ -171,8 +173,7 @@ def _sentence(summary: dict[str, Any]) -> str:
         parts.append(f"{summary['viewer_bytes'] / 1e3:.0f} kB of it the viewer")
         parts.append(f"{summary['gpu_bytes'] / 1e6:.0f} MB of graphics memory")
     if "bounds" in summary:
-        low, high = summary["bounds"]
-        parts.append(f"bounds {_corner(low)} to {_corner(high)}")
+        parts.append(f"bounds {corners_text(summary['bounds'])}")
     if "level" in summary:
         low, high = summary["densities"]
         parts.append(f"densities {low:.3g} to {high:.3g}, half opaque over a voxel at {summary['level']:.4g}")
@@ -195,10 +196,6 @@ def _sentence(summary: dict[str, Any]) -> str:
             f"the crop removed {summary['removed']:.1%} of the {'voxels' if 'voxels' in summary else 'faces'}"
         )
     return f"{summary['file']}: {', '.join(parts)}"
-
-
-def _corner(corner: list[float]) -> str:
-    return "(" + ", ".join(f"{value:.4g}" for value in corner) + ")"
 
 
 if __name__ == "__main__":

@@ -88,10 +88,23 @@ def nothing_inside(what: str, parts: str, bounds: np.ndarray) -> ConfigError:
         parts: its parts, and the words that come before its bounds: "12 faces; the mesh is".
         bounds: [2, 3] its smallest and largest coordinates.
     """
-    low, high = ("(" + ", ".join(f"{value:.4g}" for value in corner) + ")" for corner in bounds)
     return ConfigError(
-        f"--crop: expected a box with some of the {what} in it, got none of its {parts} from {low} to {high}"
+        f"--crop: expected a box with some of the {what} in it, got none of its {parts} "
+        f"from {corners_text(bounds)}"
     )
+
+
+def corners_text(bounds: np.ndarray | list[list[float]]) -> str:
+    """Return the two corners of bounds [2, 3], to four digits of their longest side, or to whole numbers: the
+    corners of a small box far from the origin then still differ.
+
+    >>> corners_text([[4500000.1251, 500000, 299.99996], [4500001.5, 500002, 300.5]])
+    '(4500000.125, 500000, 300) to (4500001.5, 500002, 300.5)'
+    """
+    low, high = np.asarray(bounds, np.float64)
+    decimals = max(3 - math.floor(math.log10(max(1e-12, float((high - low).max())))), 0)
+    corners = [[round(value, decimals) + 0.0 for value in corner.tolist()] for corner in (low, high)]
+    return " to ".join("(" + ", ".join(f"{value:.15g}" for value in corner) + ")" for corner in corners)
 
 
 def _read_box(path: Path) -> CropBox:

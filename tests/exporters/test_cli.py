@@ -160,6 +160,14 @@ def test_a_stored_mesh_that_float32_has_deformed(tmp_path: Path, capsys: pytest.
         assert not target.exists()
 
 
+def test_bounds_far_from_the_origin(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The bounds that are printed are those from which a crop is chosen, in the coordinates of a map, too."""
+    far = replace(tetrahedron(), vertices=tetrahedron().vertices + np.array([65536, 0, 0]))
+    asset = write_small_asset(tmp_path / "asset", ply_bytes(far))
+    assert cli.main([str(asset), str(tmp_path / "mesh.ply"), "--method", "baked"]) == 0
+    assert "bounds (65536, 0, 0) to (65537, 2, 3)" in capsys.readouterr().out
+
+
 def test_an_empty_folder_is_no_asset(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main([str(tmp_path), str(tmp_path / "mesh.glb")]) == 1
     assert str(tmp_path) in capsys.readouterr().err

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from exporters.shapes.crop import crop_mesh, parse_crop
+from exporters.shapes.crop import corners_text, crop_mesh, parse_crop
 from player.errors import ConfigError, FormatError
 from tests.exporters.meshes import box, sphere
 
@@ -50,6 +50,14 @@ def test_nothing_left() -> None:
         ConfigError, match=r"got none of its 12 faces; the mesh is from \(0, 0, 0\) to \(1, 1"
     ):
         crop_mesh(box((0, 0, 0), (1, 1, 1)), parse_crop("5,5,5,1,1,1"))
+
+
+def test_the_bounds_of_a_mesh_far_from_the_origin_can_be_told_apart() -> None:
+    with pytest.raises(ConfigError, match=r"from \(4500000, 0\.125, 0\) to \(4500000\.5, 1\.251, 1"):
+        crop_mesh(box((4.5e6, 0.125, -1e-9), (4500000.5, 1.25099, 1)), parse_crop("5,5,5,1,1,1"))
+    assert corners_text([[-1e-9, 0, 0], [1e-9, 0, 5e-10]]) == "(-1e-09, 0, 0) to (1e-09, 0, 5e-10)"
+    assert corners_text([[0, 0, 0], [123456.7, 9, 51]]) == "(0, 0, 0) to (123457, 9, 51)"
+    assert corners_text([[1, 2, 3], [1, 2, 3]]) == "(1, 2, 3) to (1, 2, 3)"
 
 
 @pytest.mark.parametrize(
