@@ -8,7 +8,7 @@ crashes the process on some that it does not know.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from concurrent.futures import TimeoutError as NotDone
 from contextlib import closing
@@ -229,26 +229,30 @@ def map_pictures(
 
 
 def refine_principal_points(model: Any) -> None:
-    """Refine the principal points, once, at the end, if every camera has taken enough pictures.
+    """Refine the principal points, once, at the end, of the cameras that have taken enough pictures.
 
     A phone's principal point is off by a hundredth of the picture, which turns every pose by half a degree
     and leaves a pixel of error at the border. From few pictures this cannot be told from a turn of the
     camera.
     """
     n_taken = Counter(image.camera_id for image in model.images.values() if image.has_pose)
-    if min(n_taken.values()) < MIN_FOR_PRINCIPAL_POINT:
-        return
-    adjust(model, principal_points=True)
+    enough = {camera for camera, n in n_taken.items() if n >= MIN_FOR_PRINCIPAL_POINT}
+    if enough:
+        adjust(model, enough)
 
 
-def adjust(model: Any, principal_points: bool = False) -> None:
-    """Adjust the cameras and points of a `pycolmap.Reconstruction` together (bundle adjustment), with
-    `principal_points` also the principal points."""
+def adjust(model: Any, principal_points: Collection[int] = ()) -> None:
+    """Adjust the cameras and points of a `pycolmap.Reconstruction` together (bundle adjustment). If there are
+    `principal_points`, the numbers of cameras, these are refined, too, and the other cameras keep their
+    intrinsics: COLMAP cannot keep a principal point alone."""
     pycolmap = pycolmap_module()
     options = pycolmap.BundleAdjustmentOptions()
-    options.refine_principal_point = principal_points
+    options.refine_principal_point = bool(principal_points)
     options.print_summary = False
     config = pycolmap.BundleAdjustmentConfig()
+    if principal_points:
+        for camera in {*model.cameras} - {*principal_points}:
+            config.set_constant_cam_intrinsics(camera)
     for image in model.images.values():
         if image.has_pose:
             config.add_image(image.image_id)

@@ -7,6 +7,7 @@ import shutil
 import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -53,19 +54,36 @@ def similarity(a: np.ndarray, b: np.ndarray) -> tuple[float, np.ndarray]:
     return float((s * sign).sum() / (a**2).sum()), u @ np.diag(sign) @ vt
 
 
-def test_the_principal_point_is_found_without_a_word(capfd: pytest.CaptureFixture[str]):
-    """The principal point of a camera is found silently, from exact points, if it is given 6 pixels off."""
+def synthetic_model(n_cameras: int) -> Any:
+    """Return a model with exact points, in which each camera has taken 24 pictures."""
     options = pycolmap.SyntheticDatasetOptions()
-    options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig = 1, 1, 24
+    options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig = n_cameras, 1, 24
     options.num_points3D = 200
     pycolmap.set_random_seed(0)
-    model = pycolmap.synthesize_dataset(options)
+    return pycolmap.synthesize_dataset(options)
+
+
+def test_the_principal_point_is_found_without_a_word(capfd: pytest.CaptureFixture[str]):
+    """The principal point of a camera is found silently, from exact points, if it is given 6 pixels off."""
+    model = synthetic_model(1)
     (camera,) = model.cameras.values()
     truth = camera.principal_point_x
     camera.principal_point_x = truth + 6
     mapping.refine_principal_points(model)
     assert model.camera(camera.camera_id).principal_point_x == pytest.approx(truth, abs=0.1)
     assert capfd.readouterr() == ("", "")
+
+
+def test_a_lens_of_few_pictures_keeps_its_principal_point_alone():
+    model = synthetic_model(2)
+    often, seldom = model.cameras
+    for image in [image for image in model.images.values() if image.camera_id == seldom][5:]:
+        model.deregister_frame(image.frame_id)
+    truth, kept = model.camera(often).principal_point_x, model.camera(seldom).params.tolist()
+    model.camera(often).principal_point_x = truth + 6
+    mapping.refine_principal_points(model)
+    assert model.camera(often).principal_point_x == pytest.approx(truth, abs=0.1)
+    assert model.camera(seldom).params.tolist() == kept
 
 
 @pytest.fixture(scope="module")
