@@ -170,7 +170,7 @@ def check_parts(
         n_levels: number of levels of each pyramid.
         n_channels: channels of the features.
     """
-    done = Progress(n_levels)
+    known = {grid: [-1] * n for grid, n in n_levels.items()}
     n_rows: dict[Grid, int] = {"densities": 0, "features": 0}
     for number, part in enumerate(parts):
         for section in part.sections:
@@ -184,7 +184,7 @@ def check_parts(
                     raise FormatError(f"{where}: expected at most {MAX_ROWS} vertices, got more")
             elif not 1 <= section.n_channels <= _channels(section.grid, n_channels) - section.first_channel:
                 raise FormatError(f"{where}: expected channels below {_channels(section.grid, n_channels)}")
-            done.add(section, where)
+            _check_order(section, known[section.grid], where)
 
 
 def _channels(grid: Grid, n_channels: int) -> int:
@@ -204,31 +204,27 @@ def _check_structure(section: Section, resolution: int, where: str) -> None:
         )
 
 
-class Progress:
-    """The levels and channels of the two pyramids that the sections so far have brought."""
+def _check_order(section: Section, known: list[int], where: str) -> None:
+    """Raise FormatError if a section was there before, or comes before one that it needs.
 
-    def __init__(self, n_levels: dict[Grid, int]) -> None:
-        self.n_channels = {grid: [-1] * n for grid, n in n_levels.items()}
-        """For each level: number of known channels, or -1 as long as its structure is not known."""
-
-    def add(self, section: Section, where: str) -> None:
-        """Add a section. Raises FormatError: the section was there before, or comes before one it needs."""
-        known = self.n_channels[section.grid]
-        level, coarser = section.level, section.level + 1
-        last = coarser == len(known)
-        if section.kind == "structure":
-            if known[level] >= 0:
-                raise FormatError(f"{where}: expected each structure once")
-            if not last and known[coarser] < 0:
-                raise FormatError(f"{where}: expected the structure of level {coarser} before it")
-            known[level] = 0
-            return
-        if known[level] != section.first_channel:
-            before = "the structure of the level" if known[level] < 0 else f"channel {known[level]}"
-            raise FormatError(f"{where}: expected {before} before it, each channel once")
-        if not last and known[coarser] < section.end_channel:
-            raise FormatError(f"{where}: expected these channels of level {coarser} before it")
-        known[level] = section.end_channel
+    `known` has, for each level of the pyramid, the number of channels that the sections before have brought,
+    or -1 as long as the level has no structure; it is brought up to date.
+    """
+    level, coarser = section.level, section.level + 1
+    last = coarser == len(known)
+    if section.kind == "structure":
+        if known[level] >= 0:
+            raise FormatError(f"{where}: expected each structure once")
+        if not last and known[coarser] < 0:
+            raise FormatError(f"{where}: expected the structure of level {coarser} before it")
+        known[level] = 0
+        return
+    if known[level] != section.first_channel:
+        before = "the structure of the level" if known[level] < 0 else f"channel {known[level]}"
+        raise FormatError(f"{where}: expected {before} before it, each channel once")
+    if not last and known[coarser] < section.end_channel:
+        raise FormatError(f"{where}: expected these channels of level {coarser} before it")
+    known[level] = section.end_channel
 
 
 def _show(value: object) -> str:
