@@ -143,7 +143,7 @@ def _turned(centre: list[float], yaw: float) -> np.ndarray:
 
 
 def _box(where: str, matrix: np.ndarray, size: list[float]) -> CropBox:
-    check_pose(matrix, where)
+    check_pose(matrix, where, "matrix of the box")
     if not all(edge > 0 for edge in size):
         raise ConfigError(f"{where}: size: expected three lengths > 0, got {size}")
     return CropBox(matrix, np.array(size))

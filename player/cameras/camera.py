@@ -161,12 +161,11 @@ _CONVERSIONS: dict[str, tuple[Callable[[Any], object], str]] = {
 can be written as JSON. With each, what is expected."""
 
 
-def check_pose(c2w: np.ndarray, where: str) -> None:
-    """Raise FormatError unless `c2w` [4, 4] is finite and rigid (right-handed, orthonormal within 1e-3)."""
+def check_pose(c2w: np.ndarray, where: str, what: str = "camera matrix") -> None:
+    """Raise FormatError unless `c2w` [4, 4] is finite and rigid (right-handed, orthonormal within 1e-3); the
+    message calls it `what`."""
     if c2w.shape != (4, 4):
-        raise FormatError(
-            f"{where}: camera matrix: expected 4 rows of 4 numbers, got shape {list(c2w.shape)}"
-        )
+        raise FormatError(f"{where}: {what}: expected 4 rows of 4 numbers, got shape {list(c2w.shape)}")
     rotation = c2w[:3, :3]
     rigid = (
         np.isfinite(c2w).all()
@@ -176,9 +175,7 @@ def check_pose(c2w: np.ndarray, where: str) -> None:
         and np.linalg.det(rotation) > 0
     )
     if not rigid:
-        raise FormatError(
-            f"{where}: camera matrix: expected a rotation and a translation, got {c2w.tolist()}"
-        )
+        raise FormatError(f"{where}: {what}: expected a rotation and a translation, got {c2w.tolist()}")
 
 
 def focus_point(cameras: Sequence[Camera]) -> np.ndarray:

@@ -81,7 +81,10 @@ def test_no_size() -> None:
         ('{"size": [1, 1, 1]}', "expected matrix and size"),
         ('{"centre": [0, 0], "size": [1, 1, 1]}', r"centre: expected \[3\] finite numbers"),
         ('{"centre": [0, 0, 0], "size": [1, 1, -1]}', "size: expected three lengths > 0"),
-        ('{"matrix": [[2,0,0,0],[0,2,0,0],[0,0,2,0],[0,0,0,1]], "size": [1, 1, 1]}', "expected a rotation"),
+        (
+            '{"matrix": [[2,0,0,0],[0,2,0,0],[0,0,2,0],[0,0,0,1]], "size": [1, 1, 1]}',
+            r"box\.json: matrix of the box: expected a rotation",
+        ),
     ],
 )
 def test_bad_files(text: str, message: str, tmp_path: Path) -> None:
