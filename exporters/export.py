@@ -73,6 +73,7 @@ def export_asset(
             asset that takes more memory than it may, a page that takes more graphics memory or has more
             channels than browsers can draw, two files with the same name, or a mesh or points so far from
             the origin that float32 would deform them.
+        DataError: there is no surface.
         OutputError: the target exists and `force` is not set, or cannot be written.
         FormatError: the asset, its mesh or a file of cameras is damaged.
         ParityError: what was written does not hold what was to be written.

@@ -25,7 +25,7 @@ from exporters.surface.asset_surface import AssetSurface
 from exporters.surface.depth_views import FEW_PIXELS, SMALL_PIXELS
 from exporters.surface.few_faces import few_faces
 from player.asset.asset import Asset
-from player.errors import ConfigError
+from player.errors import ConfigError, DataError
 from player.files.files import write_together
 from player.progress import Report
 
@@ -124,13 +124,17 @@ def world_mesh(surface: AssetSurface, options: ExportOptions) -> tuple[TriangleM
     grid of `exporters.surface.few_faces.RESOLUTION` voxels along the box; with a method or a level
     it keeps all of its faces.
 
-    Raises ConfigError: the stored mesh, which is in float32, is too far from the origin.
+    Raises:
+        ConfigError: the stored mesh, which is in float32, is too far from the origin.
+        DataError: the asset holds no mesh.
     """
     box = None if options.crop is None else parse_crop(options.crop)
     facts: dict[str, Any] = {"frame": options.coordinates}
     if options.method == "baked":
         where = str(surface.asset.path("mesh.ply"))
         mesh = ply.parse_ply(surface.asset.read("mesh.ply"), where)
+        if not len(mesh.faces):
+            raise DataError(f"{where}: faces: expected a mesh, got none: leave out --method baked")
         check_steps(mesh, where, "make the surface again, without --method baked")
     else:
         if options.method == "tsdf":

@@ -14,6 +14,7 @@ import pytest
 from exporters import cli, export
 from exporters.formats.glb import parse_glb
 from exporters.formats.ply import ply_bytes
+from exporters.shapes.mesh import take_faces
 from player.asset.asset import write_asset
 from player.asset.bricks import pack_vertices
 from player.asset.manifest import Manifest
@@ -158,6 +159,16 @@ def test_a_stored_mesh_that_float32_has_deformed(tmp_path: Path, capsys: pytest.
         assert "mesh.ply: vertices: expected steps of float32 of at most 0.1 times the median edge" in error
         assert error.endswith("make the surface again, without --method baked\n")
         assert not target.exists()
+
+
+@pytest.mark.parametrize("more", ["mesh.ply", "mesh.obj --lods 2", "mesh.stl --crop 0,0,0,1,1,1"])
+def test_an_asset_without_a_mesh(more: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    asset = write_small_asset(tmp_path / "asset", ply_bytes(take_faces(tetrahedron(), np.zeros(4, bool))))
+    name, *words = more.split()
+    assert cli.main([str(asset), str(tmp_path / name), *words, "--method", "baked"]) == 1
+    error = capsys.readouterr().err
+    assert error.endswith("mesh.ply: faces: expected a mesh, got none: leave out --method baked\n")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["asset"]
 
 
 def test_bounds_far_from_the_origin(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
