@@ -143,10 +143,16 @@ def needed_bytes(n_packed: int, densities: Counts, features: Counts) -> int:
     kept = sum(
         70 * grid.n_bricks + 700 * grid.n_vertex_bricks + grid.n_channels * grid.n_vertices for grid in (d, f)
     )
+    return max(decoding, kept + grid_bytes(d, f))
+
+
+def grid_bytes(densities: Counts, features: Counts) -> int:
+    """Return the most bytes that the tables of a grid and the temporaries of its building take."""
+    d, f = densities, features
     tables = sum(17 * (grid.n_per_axis + 1) ** 3 for grid in (d, f))
     densities_built = 2500 * d.n_bricks
     features_built = 800 * d.n_bricks + 2560 * f.n_bricks + 8 * f.n_vertices + 5200 * f.n_held
-    return max(decoding, kept + tables + max(densities_built, features_built))
+    return tables + max(densities_built, features_built)
 
 
 def _of_both(work: Callable[[Grid], T]) -> list[T]:

@@ -11,13 +11,13 @@ from __future__ import annotations
 import re
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
 from player.asset.bricks import bricks_per_axis, with_corners
 from player.asset.check_bricks import check_inside, check_sorted
 from player.asset.manifest import Manifest
+from player.asset.parts import Counts, grid_bytes
 from player.asset.pyramid import Bricks, PyramidValues
 from player.asset.single_level import VertexBricks, from_vertices
 from player.asset.version_3.packing import unpack_codes, unpack_masks
@@ -25,14 +25,6 @@ from player.errors import FormatError
 from player.files.files import read_bytes
 from player.files.memory import check_memory
 
-DTYPES = {
-    "brick_coords": "<u2",
-    "brick_masks": "<u8",
-    "density": "|u1",
-    "feature_coords": "<u2",
-    "feature_masks": "<u8",
-    "features": "|i1",
-}
 PLACES = {
     "brick_coords": "brick_coords.npy",
     "brick_masks": "brick_masks.bits",
@@ -55,35 +47,19 @@ _HEADER = re.compile(
 _LONGEST_HEADER = 10 + 65535
 
 
-class Counts(NamedTuple):
-    """The sizes of one of the two grids, as far as they are known yet."""
-
-    n_per_axis: int
-    """Bricks along an axis."""
-    n_bricks: int
-    n_codes: int = 0
-    """Bytes of codes."""
-    n_rows: int = 0
-    """Stored vertices."""
-    n_held: int = 0
-    """Bricks that hold a cell with a stored corner."""
-
-
 def needed_bytes(n_packed: int, densities: Counts, features: Counts) -> int:
     """Return the most bytes of memory taken while `n_packed` bytes of files are unpacked into arrays and
-    these are arranged in a grid.
-
-    The bytes for each brick, row and table entry are those of the arrays in `player.asset.asset` and
-    `player.asset.grid`, and of their temporaries. tests/player/asset/test_unpacking.py compares the sum with
-    what numpy allocates.
+    these are arranged in a grid. tests/player/asset/test_unpacking.py compares it with what numpy allocates.
     """
-    d, f = densities, features
-    kept = sum(70 * grid.n_bricks + grid.n_codes for grid in (d, f))
-    unpacking = n_packed + sum(256 * grid.n_bricks + 2 * grid.n_codes for grid in (d, f))
-    tables = sum(17 * (grid.n_per_axis + 1) ** 3 for grid in (d, f))
-    densities_built = 2500 * d.n_bricks
-    features_built = 800 * d.n_bricks + 2560 * f.n_bricks + 8 * f.n_rows + 5200 * f.n_held
-    return kept + max(unpacking, tables + max(densities_built, features_built))
+    n_bricks = densities.n_bricks + features.n_bricks
+    n_codes = sum(grid.n_vertices * grid.n_channels for grid in (densities, features))
+    unpacking = n_packed + 256 * n_bricks + 2 * n_codes
+    return 70 * n_bricks + n_codes + max(unpacking, grid_bytes(densities, features))
+
+
+def _least(n_per_axis: int, n_bricks: int) -> Counts:
+    """Return the counts of a grid of which only the number of bricks is known."""
+    return Counts(n_per_axis, n_bricks, n_bricks, n_vertices=0, n_channels=0)
 
 
 def _check_coords_files(folder: Path, manifest: Manifest, allowed: int) -> None:
@@ -98,7 +74,7 @@ def _check_coords_files(folder: Path, manifest: Manifest, allowed: int) -> None:
             raise FormatError(
                 f"{folder / name}: size: expected at most {most} bytes, got {manifest.files[name].bytes}"
             )
-    least = [Counts(n, _n_bricks(manifest, names)) for names, n in _per_axis(manifest)]
+    least = [_least(n, _n_bricks(manifest, names)) for names, n in _per_axis(manifest)]
     check_memory(needed_bytes(0, *least), allowed, str(folder))
 
 
@@ -154,15 +130,16 @@ def read_arrays(folder: Path, manifest: Manifest, allowed: int) -> tuple[VertexB
         check_inside(Bricks(coords, found), resolution + 1, "vertices", str(folder / PLACES[names[0]]))
         if of_features and not found.any():  # every sample with weight needs a feature
             raise FormatError(f"{folder / PLACES[names[1]]}: expected at least one stored vertex, got none")
-        n_rows = n_set(found)
+        n_vertices = int(np.bitwise_count(found).sum(dtype=np.int64))
         n_held = len(with_corners(coords, found, n_per_axis)) if of_features else 0
-        n_codes = n_rows * (manifest.n_channels if of_features else 1)
-        return found, Counts(n_per_axis, len(coords), n_codes, n_rows, n_held)
+        n_channels = manifest.n_channels if of_features else 1
+        return found, Counts(n_per_axis, len(coords), len(coords), n_vertices, n_channels, n_held)
 
     def codes(names: Names, counts: Counts) -> np.ndarray:
-        shape = (counts.n_rows, manifest.n_channels) if names is FEATURES else (counts.n_rows,)
-        data = read(names[2], _most_packed(counts.n_codes))
-        return unpack_codes(data, shape, DTYPES[names[2]], str(folder / PLACES[names[2]]))
+        of_features = names is FEATURES
+        shape = (counts.n_vertices, counts.n_channels) if of_features else (counts.n_vertices,)
+        data = read(names[2], _most_packed(counts.n_vertices * counts.n_channels))
+        return unpack_codes(data, shape, "i1" if of_features else "u1", str(folder / PLACES[names[2]]))
 
     (_, n_dense), (_, n_coarse) = _per_axis(manifest)
     coords, coarse = (
@@ -170,7 +147,7 @@ def read_arrays(folder: Path, manifest: Manifest, allowed: int) -> tuple[VertexB
         for names in (DENSITIES, FEATURES)
     )
     n_packed = sum(manifest.files[name].bytes for name in PLACES.values())
-    least = needed_bytes(n_packed, Counts(n_dense, len(coords)), Counts(n_coarse, len(coarse)))
+    least = needed_bytes(n_packed, _least(n_dense, len(coords)), _least(n_coarse, len(coarse)))
     check_memory(least, allowed, str(folder))
     with ThreadPoolExecutor(1) as other:  # both grids at the same time: unpacking releases the GIL
         later = other.submit(masks, FEATURES, coarse, n_coarse)
@@ -202,8 +179,3 @@ def read_coords(data: bytes, where: str) -> np.ndarray:
     if explained != len(data):
         raise FormatError(f"{where}: expected {explained} bytes as its header says, got {len(data)}")
     return np.frombuffer(data, "<u2", 3 * n_bricks, match.end()).reshape(-1, 3)
-
-
-def n_set(masks: np.ndarray) -> int:
-    """Return the number of set bits in masks of bricks [n, 8] uint64."""
-    return int(np.bitwise_count(masks).sum(dtype=np.int64))

@@ -13,8 +13,9 @@ import pytest
 from player.asset.asset import Asset
 from player.asset.bricks import bricks_per_axis, pack_vertices, with_corners
 from player.asset.manifest import Manifest, parse_manifest
+from player.asset.parts import Counts
 from player.asset.single_level import VertexBricks
-from player.asset.version_3.unpacking import PLACES, Counts, n_set, needed_bytes, read_arrays
+from player.asset.version_3.unpacking import PLACES, needed_bytes, read_arrays
 from player.errors import ConfigError, FormatError
 from player.files.memory import _group_limits, allowed_bytes
 from tests.player.conftest import cameras_bytes, head_bytes
@@ -68,7 +69,8 @@ def test_what_is_needed_is_what_is_taken(name: str, tmp_path: Path) -> None:
     for coords, masks, codes in arrays:
         n = bricks_per_axis(m.resolution)
         held = len(with_corners(coords, masks, n))
-        counts.append(Counts(n, len(coords), codes.size, n_set(masks), held))
+        n_channels = codes.size // len(codes)
+        counts.append(Counts(n, len(coords), len(coords), len(codes), n_channels, held))
     n_packed = sum(m.files[file].bytes for file in PLACES.values())
     needed = needed_bytes(n_packed, *counts)
     del arrays, coords, masks, codes
