@@ -73,7 +73,7 @@ def extract_frames(video: Path, progress: Progress, say: Callable[[str], object]
             raise DataError(f"{video}: video: expected one that OpenCV can read, with frames in it")
         with new_folder(folder) as new:
             (new / "images").mkdir()
-            stretches = _Stretches(cv2, new / "images")
+            stretches = _Stretches(cv2, new / "images", _pixel_shape(cv2, capture))
             n_read = 0
             while read:
                 stretches.add(frame)
@@ -93,11 +93,22 @@ def extract_frames(video: Path, progress: Progress, say: Callable[[str], object]
     return folder
 
 
+def _pixel_shape(cv2: Any, capture: Any) -> float:
+    """Return the width of a pixel of a video's upright frames divided by its height: in anamorphic videos
+    pixels are no squares."""
+    wide, high = capture.get(cv2.CAP_PROP_SAR_NUM), capture.get(cv2.CAP_PROP_SAR_DEN)
+    if wide <= 0 or high <= 0:
+        return 1.0  # the file does not tell
+    on_its_side = capture.get(cv2.CAP_PROP_ORIENTATION_META) in (90, 270)
+    return min(max(high / wide if on_its_side else wide / high, 0.25), 4.0)  # what is beyond is damaged
+
+
 class _Stretches:
     """The sharpest frame of every stretch of a video so far, each in a file."""
 
-    def __init__(self, cv2: Any, folder: Path) -> None:
-        self._cv2, self._folder = cv2, folder
+    def __init__(self, cv2: Any, folder: Path, pixel_shape: float) -> None:
+        """Begin with no frames. `pixel_shape`: the width of a pixel divided by its height."""
+        self._cv2, self._folder, self._pixel_shape = cv2, folder, pixel_shape
         self._flow = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
         self._before: np.ndarray | None = None
         self._step, self._moved = STEP, 0.0
@@ -131,6 +142,9 @@ class _Stretches:
         assert self._best is not None
         sharp, frame = self._best
         path = self._folder / f"stretch_{self._n_files:08d}.jpg"
+        if self._pixel_shape != 1:
+            height, width = frame.shape[:2]
+            frame = self._cv2.resize(frame, (max(1, round(width * self._pixel_shape)), height))
         rgb = self._cv2.cvtColor(shrunk(self._cv2, frame, MAX_SIDE), self._cv2.COLOR_BGR2RGB)
         Image.fromarray(rgb).save(path, quality=95)
         self._n_files += 1

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from fractions import Fraction
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -184,6 +185,37 @@ def test_colours_of_a_video(
     with Image.open(folder / "images" / "0000.jpg") as picture:
         found = np.asarray(picture)[32, 32].astype(int)
     assert np.abs(found - SRGB_COLOUR).max() <= most_off
+
+
+@pytest.mark.parametrize(
+    ("shape", "turned", "expected"),
+    [("4/3", 0, (213, 120)), ("1/2", 0, (80, 120)), ("4/3", 90, (120, 120)), ("0", 0, (160, 120))],
+)
+def test_pixels_that_are_no_squares(
+    shape: str, turned: int, expected: tuple[int, int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """Frames of an anamorphic video get the shape in which it is to be shown."""
+    path = tmp_path / "a.mp4"
+    with av.open(str(path), "w") as file:
+        stream = file.add_stream("mpeg4", 10, width=160, height=120, pix_fmt="yuv420p")
+        stream.codec_context.sample_aspect_ratio = Fraction(shape)
+        frame = av.VideoFrame.from_ndarray(textured(6, 160, 120), "bgr24")
+        file.mux([*stream.encode(frame), *stream.encode(None)])
+    whole = cv2.VideoCapture
+
+    def on_its_side(path: str) -> SimpleNamespace:
+        capture = whole(path)
+        return SimpleNamespace(
+            get=lambda key: turned if key == cv2.CAP_PROP_ORIENTATION_META else capture.get(key),
+            isOpened=capture.isOpened,
+            read=capture.read,
+            release=capture.release,
+        )
+
+    monkeypatch.setattr(cv2, "VideoCapture", on_its_side)
+    (kept,) = (video.extract_frames(path, lambda done, of: None) / "images").iterdir()
+    with Image.open(kept) as picture:
+        assert picture.size == expected
 
 
 def test_a_file_that_is_no_video(tmp_path: Path, capfd: pytest.CaptureFixture[str]):
