@@ -80,6 +80,8 @@ from vfr_bake.training.model_file import Model
 N_PROJECTED = 100_000
 """Number of rays from which the projection to fewer feature channels is computed: they give the directions in
 feature space that the colours depend on, and the second moment of the features."""
+LAST_PART = "writing and checking"
+"""The part of a bake in which the report is made."""
 
 
 @dataclass(frozen=True)
@@ -185,7 +187,7 @@ class _Bake:
             missed.extend(report.missed)
             return {"mesh.ply": data, "report.json": report.json(), "report.html": report.html()}
 
-        with self._part("writing and checking"):
+        with self._part(LAST_PART):
             manifest = replace(manifest, provenance=manifest.provenance | {"baked": figures})
             cameras = write_cameras(self.model.cameras)
             write_asset(folder, manifest, arrays, head, b"", cameras, force, finish)
@@ -428,10 +430,11 @@ class _Bake:
                 f"preset {self.config.preset}: expected a loss of at most {self.choice.target_loss_db:g} dB, "
                 f"got {last.loss}"
             )
+        pictures = list(side_by_side(self.model, asset))
+        seconds = self.seconds | {LAST_PART: time.monotonic() - self._begun - sum(self.seconds.values())}
         return BakeReport(
             f"{name}: baked with preset {self.config.preset}", self._asked(), self.held_out.table(),
-            self.held_out.measured_on(), n_bytes, self.seconds, self.left_out, self.lookups, missed,
-            list(side_by_side(self.model, asset)),
+            self.held_out.measured_on(), n_bytes, seconds, self.left_out, self.lookups, missed, pictures,
         )  # fmt: skip
 
     def _progress(self, name: str) -> Callable[[int, int], object]:

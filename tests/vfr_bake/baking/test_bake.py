@@ -379,6 +379,7 @@ def test_the_report_adds_up(model: Model, tmp_path: Path) -> None:
         if name != "manifest.json":  # lists the reports, which are written after it is counted
             assert (tmp_path / "asset" / name).stat().st_size == size
     assert sum(said["bytes"].values()) <= result.n_bytes
+    assert said["seconds"].keys() == result.figures["time"].keys(), "the report's own part is among them"
     assert said["asked"]["n_channels"] == PRESETS["fast"].n_channels and "channels" in said["left_out"]
     page = (tmp_path / "asset" / "report.html").read_text()
     assert page.count("data:image/png;base64,") == 2 and "<svg" in page
