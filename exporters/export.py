@@ -61,12 +61,12 @@ def export_asset(
     Returns:
         JSON values: `file`, `format`, `bytes`, and those that apply to the format. Meshes: `vertices`,
         `faces`, `bounds` [2][3] in WORLD units and axes whatever the frame, `frame`, `removed` (share of the
-        faces that a crop removed), `faces_asked`, `texture` (its size), `lods` (`file`, `faces`, `bytes` of
-        each level). A surface that was made again: `method`, `unseen_faces_removed`, `haze_faces_removed`,
-        `floaters_removed`, `floater_faces_removed`. Volumes: `voxels`, `densities` (their range) and `level`
-        (half opaque over a voxel), 1/unit of the frame. Others: `points`; `cameras`; `pictures`, `channels`;
-        `inputs`, `outputs`; for a page `viewer_bytes` (all but the scene's data and the poster) and
-        `gpu_bytes`.
+        faces that a crop removed), `faces_asked`, `texture` (its size), `lods` (`file`, `vertices`, `faces`,
+        `bytes` of each level). A surface that was made again: `method`, `unseen_faces_removed`,
+        `haze_faces_removed`, `floaters_removed`, `floater_faces_removed`. Volumes: `voxels`, `densities`
+        (their range) and `level` (half opaque over a voxel), 1/unit of the frame. Others: `points`;
+        `cameras`; `pictures`, `channels`; `inputs`, `outputs`; for a page `viewer_bytes` (all but the scene's
+        data and the poster) and `gpu_bytes`.
 
     Raises:
         ConfigError: an unknown suffix, a setting that does nothing or is out of range, an empty crop, an

@@ -102,17 +102,18 @@ def export_mesh(
         if number:
             mesh = _simplified(mesh, max(1, len(mesh.faces) // 2), report)
         painted = surface.painted(mesh) if is_white else mesh
-        files = _files(surface, painted, paths, options, name, matrix)
+        files, n_vertices = _files(surface, painted, paths, options, name, matrix)
         written |= files
+        n_bytes = sum(map(len, files.values()))
         levels.append(
-            {"file": str(paths[0]), "faces": len(mesh.faces), "bytes": sum(map(len, files.values()))}
+            {"file": str(paths[0]), "vertices": n_vertices, "faces": len(mesh.faces), "bytes": n_bytes}
         )
     write_together(written)
     if len(levels) > 1:
         facts["lods"] = levels
     if options.texture is not None:
         facts["texture"] = options.texture
-    counts = {"vertices": len(finest.vertices), "faces": len(finest.faces), "bounds": bounds_of(finest)}
+    counts = {"vertices": levels[0]["vertices"], "faces": len(finest.faces), "bounds": bounds_of(finest)}
     return {**counts, **facts, "bytes": sum(map(len, written.values()))}
 
 
@@ -169,8 +170,9 @@ def _files(
     options: ExportOptions,
     name: str,
     matrix: np.ndarray,
-) -> dict[Path, bytes]:
-    """Return the bytes of the files of one level of detail, after comparing them with the mesh they hold."""
+) -> tuple[dict[Path, bytes], int]:
+    """Return the bytes of the files of one level of detail, after comparing them with the mesh they hold, and
+    its number of vertices: a texture has those on its seams once for each side."""
     where, texture = str(paths[0]), None
     if options.texture is not None:
         seconds = options.time_limit or _SECONDS
@@ -183,7 +185,8 @@ def _files(
         files = obj.textured_obj_files(mesh, texture, paths[0].stem)
         check_textured_obj(files, mesh, texture, where)
         # the OBJ is written last, so that where it exists the files that it names exist too
-        return {paths[1]: files[".mtl"], paths[2]: files[".png"], paths[0]: files[".obj"]}
+        made = {paths[1]: files[".mtl"], paths[2]: files[".png"], paths[0]: files[".obj"]}
+        return made, len(mesh.vertices)
     if name == "glb":
         data = glb.glb_bytes(mesh, texture)
     elif name in ("usdc", "usda"):
@@ -191,4 +194,4 @@ def _files(
     else:
         data = {"ply": ply.ply_bytes, "obj": obj.obj_bytes, "stl": stl.stl_bytes}[name](mesh)
     check_mesh_bytes(f".{name}", data, mesh, where, texture)
-    return {paths[0]: data}
+    return {paths[0]: data}, len(mesh.vertices)

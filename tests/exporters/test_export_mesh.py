@@ -81,7 +81,7 @@ def test_levels_of_detail(cube_asset: Asset, tmp_path: Path, capsys: pytest.Capt
 
 @pytest.mark.parametrize("suffix", ["glb", "obj"])
 def test_a_texture_has_the_vertex_colours_of_the_surface(
-    suffix: str, cube_asset: Asset, tmp_path: Path
+    suffix: str, cube_asset: Asset, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """A texture has about the colours of the same surface's vertices. They differ by directions only: a
     vertex fits what all cameras see, a texel is the mean of four cameras, and the head's colours change with
@@ -89,10 +89,12 @@ def test_a_texture_has_the_vertex_colours_of_the_surface(
     target = tmp_path / f"a.{suffix}"
     asked = shlex.split("--level 20 --faces 1500 --texture 256")
     assert cli.main([str(cube_asset.folder), str(target), *asked]) == 0
+    said = capsys.readouterr().out
     names = {"glb": ["a.glb"], "obj": ["a.mtl", "a.obj", "a.png"]}[suffix]
     assert sorted(path.name for path in tmp_path.iterdir()) == names
     assert cli.main([str(cube_asset.folder), str(tmp_path / "a.ply"), "--level", "20"]) == 0
     read = trimesh.load_mesh(target, process=False)
+    assert f": {len(read.vertices)} vertices, {len(read.faces)} faces, " in said
     places = read.vertices if suffix == "obj" else read.vertices[:, [0, 2, 1]] * [1, -1, 1]
     plain = read_ply(tmp_path / "a.ply")
     nearest = np.array([np.abs(plain.vertices - place).sum(-1).argmin() for place in places])
