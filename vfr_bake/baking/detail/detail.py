@@ -17,8 +17,7 @@ from player.asset.grid import SparseGrid
 from player.cameras.camera import Camera
 from player.progress import Progress
 from vfr_bake.baking.detail.errors import (
-    LevelsOfDensities,
-    LevelsOfFeatures,
+    BrickLevels,
     density_errors,
     feature_errors,
     heavy_vertices,
@@ -217,9 +216,7 @@ class Detail:
         choice = Choice(pyramid, tuple(feature_errors(levels, rays)))
         return Levels(choice, self._shown(choice, levels, FEATURE_LOSS, "features' detail"), values)
 
-    def _shown(
-        self, choice: Choice, levels: LevelsOfDensities | LevelsOfFeatures, share: float, name: str
-    ) -> list[np.ndarray]:
+    def _shown(self, choice: Choice, levels: BrickLevels, share: float, name: str) -> list[np.ndarray]:
         """Choose the bricks of each level to drop, for a loss of up to `share` of the allowed loss."""
         if len(choice.errors) == 1:
             return []

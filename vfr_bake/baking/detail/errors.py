@@ -46,28 +46,31 @@ def finest_numbers(pyramid: Pyramid, n_per_axis: int) -> np.ndarray:
 
 
 @dataclass(frozen=True, eq=False)
-class LevelsOfFeatures:
-    """The features of several levels, any of which may show each brick of the finest level."""
+class BrickLevels:
+    """The densities or the features of several levels, any of which may show each brick of the finest
+    level."""
 
     grid: SparseGrid
-    """The grid as the player has it, with the features of all these levels."""
+    """The grid as the player has it, with the densities or the features of all these levels."""
+    of_features: bool
     entries: np.ndarray
-    """[n_levels, n_bricks] int32: the entry in the table of rows for each brick of the finest level, if it is
-    shown by that level."""
+    """[n_levels, n_bricks] int32: the entry in the grid's table, or in that of the rows of the features, for
+    each brick of the finest level, if it is shown by that level."""
     numbers: np.ndarray
-    """[n_bricks]: the indices of these bricks in the table of rows."""
+    """[n_bricks]: the indices of these bricks in the table."""
 
     def at(self, levels: np.ndarray | int) -> SparseGrid:
         """Return the grid with each brick of the finest level shown by the level in `levels` [n_bricks], or
         all of them by the same level."""
-        rows, bricks = self.grid.rows, self.grid.rows.bricks.copy()
-        bricks[self.numbers] = self.entries[levels, np.arange(len(self.numbers))]
-        return replace(self.grid, rows=replace(rows, bricks=bricks))
+        grid, rows = self.grid, self.grid.rows
+        table = (rows.bricks if self.of_features else grid.table).copy()
+        table[self.numbers] = self.entries[levels, np.arange(len(self.numbers))]
+        if self.of_features:
+            return replace(grid, rows=replace(rows, bricks=table))
+        return replace(grid, table=table)
 
 
-def levels_of_features(
-    grid: SparseGrid, pyramid: Pyramid, codes: np.ndarray, n_levels: int
-) -> LevelsOfFeatures:
+def levels_of_features(grid: SparseGrid, pyramid: Pyramid, codes: np.ndarray, n_levels: int) -> BrickLevels:
     """Make the features of the `n_levels` finest levels of a pyramid, of which any may show each brick.
     `codes` int8 [n_vertices, n_channels] are those of all levels, one after the other, the finest first."""
     found = [vertex_rows(alone(pyramid, level)) for level in range(n_levels)]
@@ -81,34 +84,11 @@ def levels_of_features(
         n_bricks += len(of_level.rows) // 729
         n_rows += pyramid.vertices[level].n
     together = replace(found[0], rows=np.concatenate(rows))
-    return LevelsOfFeatures(
-        replace(grid, rows=together, features=codes[:n_rows]), np.array(entries, np.int32), numbers
-    )
+    grid = replace(grid, rows=together, features=codes[:n_rows])
+    return BrickLevels(grid, True, np.array(entries, np.int32), numbers)
 
 
-@dataclass(frozen=True, eq=False)
-class LevelsOfDensities:
-    """The densities of several levels, any of which may show each brick of the finest level."""
-
-    grid: SparseGrid
-    """The grid as the player has it, with the densities of all these levels."""
-    entries: np.ndarray
-    """[n_levels, n_bricks] int32: the entry in the grid's table for each brick of the finest level, if it is
-    shown by that level."""
-    numbers: np.ndarray
-    """[n_bricks]: the indices of these bricks in the table."""
-
-    def at(self, levels: np.ndarray | int) -> SparseGrid:
-        """Return the grid with each brick of the finest level shown by the level in `levels` [n_bricks], or
-        all of them by the same level."""
-        table = self.grid.table.copy()
-        table[self.numbers] = self.entries[levels, np.arange(len(self.numbers))]
-        return replace(self.grid, table=table)
-
-
-def levels_of_densities(
-    grid: SparseGrid, pyramid: Pyramid, values: Sequence[np.ndarray]
-) -> LevelsOfDensities:
+def levels_of_densities(grid: SparseGrid, pyramid: Pyramid, values: Sequence[np.ndarray]) -> BrickLevels:
     """Make the densities of the finest levels of a pyramid, of which any may show each brick.
 
     `values` are the codes of each of these levels, uint8 [n_vertices, 1]; `grid` is the grid of the finest
@@ -133,7 +113,7 @@ def levels_of_densities(
         grid, density=np.append(density, np.zeros(SPARE, np.uint8)), live=live, slot_coords=coords,
         slot_levels=levels, level_steps=np.ones(len(values), np.int32),
     )  # fmt: skip
-    return LevelsOfDensities(together, np.array(entries, np.int32), numbers)
+    return BrickLevels(together, False, np.array(entries, np.int32), numbers)
 
 
 class Segments(NamedTuple):
@@ -163,7 +143,7 @@ def samples_of(grid: SparseGrid, rays: TeacherRays) -> Iterator[Segments]:
         yield Segments(sampled.points, samples.weights, left, samples.ray)
 
 
-def heavy_vertices(levels: LevelsOfFeatures, n: int, rays: TeacherRays) -> np.ndarray:
+def heavy_vertices(levels: BrickLevels, n: int, rays: TeacherRays) -> np.ndarray:
     """Return [n] float32 above 0: for each vertex of the finest level, the summed weights of the samples
     around it, plus a little, so that vertices that no ray sees are not 0."""
     grid, totals = levels.at(0), np.zeros(n, np.float32)
@@ -173,7 +153,7 @@ def heavy_vertices(levels: LevelsOfFeatures, n: int, rays: TeacherRays) -> np.nd
     return totals + np.float32(max(1e-2 * float(totals.mean()), 1e-6))
 
 
-def feature_errors(levels: LevelsOfFeatures, rays: TeacherRays) -> np.ndarray:
+def feature_errors(levels: BrickLevels, rays: TeacherRays) -> np.ndarray:
     """Return [n_levels, n_bricks] float64: the error by showing each level in each brick of the finest level;
     0 for the finest level itself."""
     n_levels, n_bricks = levels.entries.shape
@@ -204,7 +184,7 @@ def feature_errors(levels: LevelsOfFeatures, rays: TeacherRays) -> np.ndarray:
     return out
 
 
-def density_errors(levels: LevelsOfDensities, rays: TeacherRays) -> np.ndarray:
+def density_errors(levels: BrickLevels, rays: TeacherRays) -> np.ndarray:
     """Return [n_levels, n_bricks] float64: the errors of the densities, as `feature_errors` those of the
     features."""
     n_levels, n_bricks = levels.entries.shape
