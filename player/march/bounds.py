@@ -22,6 +22,9 @@ BLOCK = 8
 MARGIN_PX = 0.01
 """Pixels by which projections are grown: far more than the rounding of float64."""
 
+MOST_PAIRS = 1 << 20
+"""Pairs of a brick and a block under it that are listed at a time: about 50 MB of arrays."""
+
 
 class CameraBricks(NamedTuple):
     """n bricks of one size in camera coordinates: x points right, y up, and the camera looks along -z."""
@@ -74,7 +77,10 @@ def block_bounds(grid: SparseGrid, camera: Camera) -> tuple[np.ndarray, np.ndarr
     y = camera.cy - camera.fy * (first[shown, 1] + corners[:, 1, None]) / depths[:, shown]
     left, right = _range(x, shape[1])
     top, bottom = _range(y, shape[0])
-    _spread((left, right, top, bottom), starts[shown], ends[shown], near, far)
+    group = np.cumsum((right - left) * (bottom - top)) // MOST_PAIRS
+    for some in np.split(np.arange(len(shown)), np.flatnonzero(np.diff(group)) + 1):
+        box = left[some], right[some], top[some], bottom[some]
+        _spread(box, starts[shown[some]], ends[shown[some]], near, far)
     return near, far
 
 

@@ -153,6 +153,22 @@ def test_block_bounds_leave_empty_sky_away(asset: Asset, camera: Camera) -> None
     assert not (far >= near).any()
 
 
+def test_block_bounds_of_a_large_picture_take_little_memory(
+    asset: Asset, camera: Camera, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Bricks are projected in groups, whose size changes no bound."""
+    model = camera.resized(960, 800).transformed(np.linalg.inv(asset.world_from_model))
+    found, peaks = [], []
+    for most in (1 << 40, 1000, 1):
+        monkeypatch.setattr("player.march.bounds.MOST_PAIRS", most)
+        tracemalloc.start()
+        found.append([bounds.tobytes() for bounds in block_bounds(asset.grid, model)])
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    assert found[0] == found[1] == found[2]
+    assert max(peaks[1:]) < peaks[0] / 4
+
+
 def test_looking_away_is_background(asset: Asset, camera: Camera) -> None:
     away = replace(camera, c2w=camera.c2w @ np.diag([-1.0, 1, -1, 1]))
     frame = render(asset, away, background=(0.0, 1.0, 0.5))
