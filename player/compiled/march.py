@@ -129,7 +129,11 @@ def enter(
     bounds: Bounds | None = None,
     opaque_depth: np.float32 = MAX_TAU,
 ) -> Entered:
-    """Find where rays enter a grid of either kind; the arguments are those of `march`."""
+    """Find where rays enter a grid of either kind; the arguments are those of `march`.
+
+    Origins are copied: those of a single ray may be a contiguous array that is read-only, for which numba
+    would compile again.
+    """
     lookup = Lookup(
         grid.table, grid.live, grid.density, grid.level_steps, grid.resolution, grid.n_per_axis,
         int(grid.level_steps[0] == 1), grid.most_steps, grid.density_low, grid.density_slope,
@@ -155,7 +159,7 @@ def _enter_box(
         F32(grid.resolution), grid.aabb_min, grid.cells_per_unit, grid.step,
         F32(grid.most_samples - 1) * grid.step,  # there is no room for more samples, whatever the ray
         grid.most_steps,
-        np.ascontiguousarray(rays_o, F32), np.ascontiguousarray(rays_d, F32), near, far, packets,
+        np.array(rays_o, F32, order="C"), np.ascontiguousarray(rays_d, F32), near, far, packets,
     )  # fmt: skip
     return BoxSteps(grid.step), packets
 
@@ -164,7 +168,7 @@ def _enter_space(grid: SparseGrid, rays_o: np.ndarray, rays_d: np.ndarray) -> tu
     """Make the packets of rays through contracted space, [n_packets, SPACE_ROWS, LANES] float32."""
     packets = scratch((-(-len(rays_o) // LANES), SPACE_ROWS, LANES), F32, 0)
     _enter_curves(
-        np.ascontiguousarray(rays_o, F32), np.ascontiguousarray(rays_d, F32), float(grid.near),
+        np.array(rays_o, F32, order="C"), np.ascontiguousarray(rays_d, F32), float(grid.near),
         math.acos(float(MIN_COS)), packets,
     )  # fmt: skip
     angle = np.arange(grid.level_steps[-1] + 1).astype(F32) * grid.step

@@ -17,6 +17,7 @@ from player import render as render_module
 from player.asset.asset import Asset
 from player.cameras.camera import Camera
 from player.cameras.transforms import read_cameras
+from player.compiled import march as march_compiled
 from player.compiled import pixels as pixels_compiled
 from player.errors import ConfigError, FormatError, MissingExtraError, ShapeError
 from player.files.images import png_bytes
@@ -28,6 +29,7 @@ from player.render import FRAME_BYTES, MAX_PIXELS, Renderer, render
 from tests.numerics.bounds import Row
 from tests.player.conftest import head_arrays, head_bytes, look_at
 from tests.player.march.oracle_march import Scene, march_ray
+from tests.player.march.pyramid_scene import random_scene
 
 LOOP = Row(
     "Pictures", "rgb against a float64 loop over rays, samples and head", "every 37th pixel", 2e-4,
@@ -224,6 +226,22 @@ def test_rounding_in_bands_is_the_formula_within_the_memory_of_a_frame(
 def test_sizes_that_are_no_multiple_of_a_block(size: tuple[int, int], asset: Asset, camera: Camera) -> None:
     frame = render(asset, camera.resized(*size))
     assert frame.rgb.shape == (size[1], size[0], 3) and frame.opacity[size[1] // 2, size[0] // 2] > 0
+
+
+@pytest.mark.extra
+@pytest.mark.parametrize("contracted", [False, True])
+def test_a_single_ray_is_marched_by_the_code_of_all_others(contracted: bool) -> None:
+    """The origin of a single ray is a contiguous view of the camera's that is read-only. Numba does not
+    compile anything for it."""
+    from numba import types
+
+    camera, zero = inside_camera(), np.zeros(1)
+    rays_o, rays_d = pixels.rays_of_pixels(camera, zero, zero, 0.0)
+    assert rays_o.flags.c_contiguous and not rays_o.flags.writeable
+    march_compiled.enter(random_scene(20, 20, (1,), 2, contracted).grid, rays_o, rays_d)
+    enters: Any = march_compiled._enter_curves if contracted else march_compiled._enter_rays
+    arguments = [kind for signature in enters.signatures for kind in signature]
+    assert all(kind.mutable for kind in arguments if isinstance(kind, types.Array))
 
 
 def test_too_large_and_other_settings(asset: Asset, camera: Camera, monkeypatch: pytest.MonkeyPatch) -> None:
