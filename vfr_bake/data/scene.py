@@ -24,6 +24,10 @@ BORDER = 2
 PLAIN_SHARE, PLAIN_LEVELS = 0.95, 8
 """A background is plain if at least PLAIN_SHARE of the border pixels are within PLAIN_LEVELS of one
 colour."""
+DARK = 16
+"""A colour whose levels are no higher than this, half a percent of white's light, does not tell of an object
+unless the border pixels have exactly this colour, as in rendered pictures: the dark parts of photographs are
+within a few levels of black, whatever is there."""
 N_LOOKED_AT = 200
 """Number of pictures, spread evenly, whose silhouettes and borders are examined."""
 CAMERA_QUANTILE = 0.9
@@ -95,7 +99,7 @@ def build_scene(capture: Capture, kind: SceneKind = "auto") -> Scene:
         )
     # An object is transparent around it in all its pictures; a few holes say nothing of the others.
     mostly_opaque = 2 * n_transparent < n_views
-    plain = _plain_border(some) if mostly_opaque else None
+    plain = _plain_border(some, exact_if_dark=kind == "auto") if mostly_opaque else None
     unbounded = kind == "unbounded" or (kind == "auto" and mostly_opaque and plain is None)
     if unbounded:
         centre, half = _camera_ball(train.cameras)
@@ -157,15 +161,17 @@ def evenly(n_views: int, n_chosen: int) -> np.ndarray:
     return np.linspace(0, n_views - 1, min(n_chosen, n_views)).round().astype(int)
 
 
-def _plain_border(views: PosedImages) -> tuple[float, float, float] | None:
-    """Return the colour of the pictures' borders, sRGB in [0, 1]; None if they show more than one colour."""
+def _plain_border(views: PosedImages, exact_if_dark: bool) -> tuple[float, float, float] | None:
+    """Return the colour of the pictures' borders, sRGB in [0, 1]; None if they show more than one colour.
+    `exact_if_dark`: whether the pixels of a DARK border have to be exactly equal."""
     edges = [
         views.pixels(number, _border(camera.width, camera.height))[:, :3]
         for number, camera in enumerate(views.cameras)
     ]
     pixels = np.concatenate(edges).astype(np.int16)
     colour = np.median(pixels, axis=0).round()
-    if (np.abs(pixels - colour).max(axis=1) <= PLAIN_LEVELS).mean() < PLAIN_SHARE:
+    levels = 0 if exact_if_dark and colour.max() <= DARK else PLAIN_LEVELS
+    if (np.abs(pixels - colour).max(axis=1) <= levels).mean() < PLAIN_SHARE:
         return None
     red, green, blue = (colour / 255).tolist()
     return red, green, blue

@@ -105,6 +105,19 @@ def test_the_kind_of_scene_is_seen_and_can_be_overruled():
     assert build_scene(Capture("alpha", train, test), "unbounded").unbounded
 
 
+def test_a_dark_photograph_has_no_plain_background():
+    """The border of pictures by night is within a few levels of black, and that of rendered ones is black."""
+    train, test = demo_views(24, 10, 2)
+    random = np.random.default_rng(0)
+    for brightest, unbounded in ((0, False), (6, True)):
+        dark = opaque(train, [0, 0, 0])
+        for image in dark.images:
+            noise = random.integers(0, brightest + 1, image[..., :3].shape, np.uint8)
+            image[..., :3] = np.maximum(image[..., :3], noise)
+        assert build_scene(Capture("dark", dark, test)).unbounded == unbounded
+        assert max(build_scene(Capture("dark", dark, test), "object").background) < 0.03
+
+
 def test_a_few_transparent_pixels_do_not_make_an_object():
     train, test = demo_views(24, 10, 2)
     around = opaque(train, None)
