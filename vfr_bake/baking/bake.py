@@ -80,6 +80,9 @@ from vfr_bake.training.model_file import Model
 N_PROJECTED = 100_000
 """Number of rays from which the projection to fewer feature channels is computed: they give the directions in
 feature space that the colours depend on, and the second moment of the features."""
+DETAIL_SHARE = 0.5
+"""Share of what is left of the loss that was asked for, which giving up detail may lose at most; rounding the
+values that stay loses the rest."""
 LAST_PART = "writing and checking"
 """The part of a bake in which the report is made."""
 
@@ -155,6 +158,9 @@ class _Bake:
         head = head_onnx(stored.head, tuning.ranges)
         played = runner(stored.head, tuning.ranges)
         most_db = self.choice.culled_loss_db
+        if self.config.max_loss_db is not None:
+            left_db = self.config.max_loss_db - tuning.kept.loss.db
+            most_db = min(most_db, max(DETAIL_SHARE * left_db, 0.0))
         detail = Detail(self.held_out, played, self.n_fetches, most_db, self._progress("detail"))
         with self._part("detail"):
             needed = self._needed(detail, layout, stored, teacher)

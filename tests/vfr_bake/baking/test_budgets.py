@@ -130,6 +130,34 @@ def test_time_that_is_left_changes_nothing(model: Model, tmp_path: Path) -> None
     assert (a.n_fetches, a.files["head.onnx"].bytes) == (b.n_fetches, b.files["head.onnx"].bytes)
 
 
+def test_detail_takes_no_more_than_half_of_the_loss_that_is_left(
+    model: Model, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Refinement has lost 0.3 dB, and the preset gives up 0.06 dB of detail if that is not limited."""
+    work = _Bake(model, BakeConfig(**SMALL), silent)
+    layout, _ = work._cells()
+    stored = work._store(layout, 20_000)
+    allowed: list[float] = []
+
+    def detail(held_out: Any, head: Any, n_fetches: int, most_db: float, progress: Any) -> None:
+        allowed.append(most_db)
+        raise TrainingError("as far as this")
+
+    def refined(tuning: Any, stored: Stored, *_: Any) -> Stored:
+        tuning.kept = SimpleNamespace(loss=Loss(0.3, 0.0))
+        return stored
+
+    monkeypatch.setattr(work, "_cells", lambda: (layout, 20_000))
+    monkeypatch.setattr(work, "_store", lambda *_: stored)
+    monkeypatch.setattr("vfr_bake.baking.bake.Tuning.run", refined)
+    monkeypatch.setattr("vfr_bake.baking.bake.Detail", detail)
+    for limit in (None, 9.0, 0.34, 0.2):
+        work.config = replace(work.config, max_loss_db=limit)
+        with pytest.raises(TrainingError, match="as far as this"):
+            work.run(tmp_path / "asset", False)
+    assert allowed == pytest.approx([0.06, 0.06, 0.02, 0.0])
+
+
 def test_a_size_that_cannot_be_met_is_refused_when_the_bake_is_planned(
     model: Model, monkeypatch: pytest.MonkeyPatch
 ) -> None:
