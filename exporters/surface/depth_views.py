@@ -151,6 +151,4 @@ def _farthest_around(distance: np.ndarray) -> np.ndarray:
 def _small(camera: Camera, max_pixels: int) -> Camera:
     """Return the camera at a size of at most `max_pixels` pixels."""
     share = (max_pixels / (camera.width * camera.height)) ** 0.5
-    if share >= 1:
-        return camera
-    return camera.resized(max(1, round(camera.width * share)), max(1, round(camera.height * share)))
+    return camera if share >= 1 else camera.scaled(share)

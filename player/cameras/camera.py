@@ -103,8 +103,10 @@ class Camera:
         (640, 480, 320.0)
         """
         share = longest / max(self.width, self.height)
-        if share >= 1:
-            return self
+        return self if share >= 1 else self.scaled(share)
+
+    def scaled(self, share: float) -> Camera:
+        """Return the same view with `share` times as many pixels along each side, but at least one."""
         return self.resized(max(round(self.width * share), 1), max(round(self.height * share), 1))
 
     def transformed(self, matrix: np.ndarray) -> Camera:

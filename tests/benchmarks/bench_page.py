@@ -98,10 +98,7 @@ def main() -> None:
     every = read_cameras(asset.path("cameras.json"))
     chosen = [every[i] for i in np.linspace(0, len(every) - 1, arguments.views).astype(int)]
     shares = [arguments.size / max(camera.width, camera.height) for camera in chosen]
-    cameras = [
-        camera.resized(round(camera.width * share), round(camera.height * share))
-        for camera, share in zip(chosen, shares, strict=True)
-    ]
+    cameras = [camera.scaled(share) for camera, share in zip(chosen, shares, strict=True)]
     with chromium() as browser, tempfile.TemporaryDirectory() as folder:
         page = RenderPage(browser, asset, Path(folder) / "scene.html")
         times = page.page.evaluate("() => times")

@@ -188,7 +188,7 @@ def side_by_side(model: Model, asset: Asset) -> Iterator[Pictures]:
     with Renderer(asset) as renderer:
         for view in views_between(model, N_PICTURES, seed=3):
             share = min(1.0, float(np.sqrt(PICTURE_PIXELS / (view.width * view.height))))
-            camera = view.resized(max(round(share * view.width), 1), max(round(share * view.height), 1))
+            camera = view.scaled(share)
             full = render_image(model.field, model.sampler, camera, model.background)
             played = renderer.render(camera.transformed(model.world_from_model)).rgb
             yield Pictures(camera.name, full, played)

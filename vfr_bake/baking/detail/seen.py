@@ -45,8 +45,7 @@ def block_weights(grid: SparseGrid, cameras: list[Camera], n_rays: int, progress
     totals = np.zeros(len(grid.slot_coords) * BLOCKS**3)
     share = min(np.sqrt(n_rays / sum(camera.width * camera.height for camera in cameras)), 1.0)
     for index, camera in enumerate(cameras):
-        size = (max(1, round(camera.width * share)), max(1, round(camera.height * share)))
-        rays_o, rays_d = camera.resized(*size).rays()
+        rays_o, rays_d = camera.scaled(share).rays()
         for first in range(0, len(rays_o), RAYS_AT_ONCE):
             rows = slice(first, first + RAYS_AT_ONCE)
             met = sample_rays(grid, rays_o[rows], rays_d[rows], get_num_threads())
