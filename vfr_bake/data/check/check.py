@@ -23,6 +23,7 @@ from vfr_bake.data.check.verdict import GOOD_SHARED, judged
 from vfr_bake.data.files.archives import is_archive, unpack
 from vfr_bake.data.files.estimate_record import read_record
 from vfr_bake.data.files.listing import find_pictures, other_kinds
+from vfr_bake.data.files.masks import mask_of
 from vfr_bake.data.files.pictures import DescribedView, picture_size
 from vfr_bake.data.files.video import extract_frames
 from vfr_bake.data.folders import has_transforms, load_folder
@@ -98,6 +99,7 @@ class _Set:
     kind: str
     names: list[str]
     paths: list[Path]
+    masks: list[Path | None]
     found: list[bool | None]
     cameras: list[Camera] = field(default_factory=list)
     why: dict[str, str] = field(default_factory=dict)
@@ -141,7 +143,7 @@ def check_data(
     """
     begin = time.monotonic()
     pictures = _listed(data, progress or (lambda done, of: None))
-    looks = look_at(pictures.paths, 0.8 * seconds, progress, most)
+    looks = look_at(list(zip(pictures.paths, pictures.masks, strict=True)), 0.8 * seconds, progress, most)
     seen = [look if isinstance(look, PictureMeasures) else None for look in looks]
     shared = compare(seen, 0.2 * seconds)
     blurry = _blurred(seen)
@@ -188,6 +190,7 @@ def _listed(data: str, progress: Progress) -> _Set:
         reader = _Describing()
         load_folder(folder, None, reader)
         paths = [view.path for view in reader.described]
+        masks = [view.mask for view in reader.described]
         cameras = [view.camera for view in reader.described]
         names = [camera.name for camera in cameras]
         kind = "transforms.json" if has_transforms(folder) else "COLMAP"
@@ -198,19 +201,19 @@ def _listed(data: str, progress: Progress) -> _Set:
             place, there = find_pictures(folder)
             known = set(paths)
             others = [path for path in there if path not in known]
-            names += [path.relative_to(place).as_posix() for path in others]
-            paths = paths + others
+            new_names = [path.relative_to(place).as_posix() for path in others]
+            names, paths = names + new_names, paths + others
+            masks += [mask_of(folder, name) for name in new_names]
             found += [False] * len(others)
             why = read_record(model).why_without_camera()
             new = f"added after the cameras were estimated: remove {folder / 'sparse'} to use it"
             why |= dict.fromkeys(added_since(folder), new)
-        return _Set(kind, names, paths, found, cameras, why)
+        return _Set(kind, names, paths, masks, found, cameras, why)
     place, paths = find_pictures(folder)
     if not paths:
         raise DataError(f"{folder}: expected a folder of pictures or a video, got none{other_kinds(folder)}")
-    return _Set(
-        "none yet", [path.relative_to(place).as_posix() for path in paths], paths, [None] * len(paths)
-    )
+    names = [path.relative_to(place).as_posix() for path in paths]
+    return _Set("none yet", names, paths, [mask_of(folder, name) for name in names], [None] * len(paths))
 
 
 def _size(path: Path) -> tuple[int, int] | None:

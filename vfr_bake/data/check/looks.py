@@ -18,6 +18,7 @@ from player.errors import DataError
 from player.progress import Progress
 from vfr_bake.data.check.turning import MIN_MATCHES, OFF
 from vfr_bake.data.features import match
+from vfr_bake.data.files.masks import apply_mask
 from vfr_bake.data.files.pictures import (
     SHARPNESS_SIDE,
     decoding_bytes,
@@ -76,11 +77,14 @@ class Shared(NamedTuple):
     neighbours."""
 
 
-def look(path: Path) -> PictureMeasures:
-    """Look at one picture. Raises DataError, MissingExtraError."""
+def look(path: Path, mask: Path | None) -> PictureMeasures:
+    """Look at what is not masked of one picture. Raises DataError, MissingExtraError."""
     cv2 = opencv(f"{path}: picture: expected OpenCV to look at it", "train")
     size = picture_size(path, upright=True)
-    rgba = read_picture(path, True, enough_for(size, SHARPNESS_SIDE))
+    # A picture with a mask is decoded at its full size, because its mask has that size.
+    rgba = read_picture(path, True, None if mask is not None else enough_for(size, SHARPNESS_SIDE))
+    if mask is not None:
+        rgba = apply_mask(rgba, path, mask, upright=True)
     small = shrunk(cv2, rgba, SHARPNESS_SIDE)
     grey = cv2.cvtColor(small, cv2.COLOR_RGBA2GRAY)
     seen = small[..., 3] > 127
@@ -126,30 +130,35 @@ def _features(cv2: Any, rgba: np.ndarray, light: np.ndarray) -> tuple[np.ndarray
 
 
 def look_at(
-    paths: Sequence[Path], seconds: float, progress: Progress | None = None, most: int | None = None
+    pictures: Sequence[tuple[Path, Path | None]],
+    seconds: float,
+    progress: Progress | None = None,
+    most: int | None = None,
 ) -> list[PictureMeasures | str | None]:
-    """Look at pictures for about `seconds`, and at no more than `most`.
+    """Look at pictures for about `seconds`, and at no more than `most`. `pictures`: each with its mask, if it
+    has one.
 
     Pairs of neighbours are taken in an order that spreads them over all pictures, so that those seen in the
     time are a sample of all. Returns for each picture what was seen, the reason why it cannot be read, or
     None if the time was over. Raises MissingExtraError.
     """
     end = time.monotonic() + seconds
-    pairs = sorted(range((len(paths) + 1) // 2), key=lambda pair: pair * GOLDEN % 1)
-    order = [i for pair in pairs for i in (2 * pair, 2 * pair + 1) if i < len(paths)][:most]
+    pairs = sorted(range((len(pictures) + 1) // 2), key=lambda pair: pair * GOLDEN % 1)
+    order = [i for pair in pairs for i in (2 * pair, 2 * pair + 1) if i < len(pictures)][:most]
 
     def looked(number: int) -> tuple[int, PictureMeasures | str | None]:
         if time.monotonic() > end:
             return number, None
         try:
-            return number, look(paths[number])
+            return number, look(*pictures[number])
         except DataError as error:
             return number, str(error)
 
-    seen: list[PictureMeasures | str | None] = [None] * len(paths)
+    seen: list[PictureMeasures | str | None] = [None] * len(pictures)
     # Headers of thousands of pictures on a slow disk could take all of the time.
     sized = takewhile(lambda _: time.monotonic() < end - 0.9 * seconds, order)
-    most_bytes = max((decoding_bytes(paths[number], SHARPNESS_SIDE) for number in sized), default=1)
+    masked = [(path, SHARPNESS_SIDE if mask is None else None) for path, mask in pictures]
+    most_bytes = max((decoding_bytes(*masked[number]) for number in sized), default=1)
     for done, (number, found) in enumerate(one_by_one(looked, order, n_threads(most_bytes))):
         seen[number] = found
         if progress is not None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import sys
+from dataclasses import replace
 from pathlib import Path, PurePath
 
 import numpy as np
@@ -98,6 +99,35 @@ def test_exposure_that_changes(tmp_path: Path) -> None:
     check = checked(folder)
     assert 1.0 < check.figures["exposure_spread"] < 2.5  # 0.6 of the levels: 1.6 powers of two in light
     assert any("lock the exposure" in line for line in check.advice)
+
+
+@pytest.mark.parametrize("with_cameras", [False, True])
+def test_what_is_masked_does_not_count(with_cameras: bool, tmp_path: Path) -> None:
+    """A bright sign that moves with the camera is masked: features are found below it alone, and the exposure
+    is that of the darker rest."""
+    folder = walk(tmp_path / "walk", 8)
+    (folder / "masks").mkdir()
+    if with_cameras:
+        frames = [replace(camera, name=f"p{i:02d}.jpg") for i, camera in enumerate(demo_cameras(480, 8))]
+        cameras = [replace(camera, height=400, cy=200.0) for camera in frames]
+        (folder / "transforms.json").write_bytes(write_cameras(cameras))
+    mask = Image.new("L", (480, 400), 255)
+    mask.paste(0, (0, 0, 480, 300))
+    sign = wall(9).crop((0, 0, 480, 300)).point(lambda level: level // 2 + 128)
+    for path in folder.glob("*.jpg"):
+        with Image.open(path) as picture:
+            signed = picture.copy()
+        signed.paste(sign)
+        signed.save(path, quality=95)
+    without = checked(folder)
+    for path in folder.glob("*.jpg"):
+        mask.save(folder / "masks" / f"{path.stem}.png")
+    check = checked(folder)
+    looks = [picture.look for picture in check.pictures]
+    assert all(look is not None and (look.points[:, 1] > 0.19).all() for look in looks)
+    for one, other in zip(check.pictures, without.pictures, strict=True):
+        assert one.look is not None and other.look is not None
+        assert one.look.exposure < other.look.exposure - 0.3
 
 
 def test_a_file_that_is_no_picture_is_named(tmp_path: Path) -> None:
