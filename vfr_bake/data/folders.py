@@ -15,7 +15,7 @@ from player.cameras.camera import Camera
 from player.cameras.colmap import RegisteredImage, colmap_folder, read_cameras, read_images, read_points
 from player.cameras.transforms import load_transforms, transforms_cameras, transforms_number
 from player.errors import DataError, FormatError
-from player.files.json_files import brief
+from player.files.json_files import as_float, brief
 from player.progress import Progress
 from vfr_bake.data.capture import Capture, PosedImages, held_out
 from vfr_bake.data.files.estimate_record import read_record
@@ -278,9 +278,23 @@ def _mask(path: Path, index: int, frame: dict[str, Any], picture: Path) -> Path 
 
 
 def _distortion(document: dict[str, Any], path: Path, index: int) -> dict[str, float]:
+    """Return the lens distortion of a frame, whose numbers are given by name or by nerfstudio's list
+    `distortion_params`. A frame takes precedence over the top, and a name over a list. Raises FormatError."""
     frame = document["frames"][index]
     where = f"{path}: frame {index} ({frame['file_path']})"
-    return {key: transforms_number(document, frame, key, where) or 0.0 for key in DISTORTION_KEYS}
+    distortion = dict.fromkeys(DISTORTION_KEYS, 0.0)
+    for level in (document, frame):
+        listed = level.get("distortion_params") or []
+        values = listed if isinstance(listed, list) else []
+        numbers = [number for value in values if (number := as_float(value)) is not None]
+        if listed and not len(numbers) == len(values) == len(DISTORTION_KEYS):
+            expected = f"expected {len(DISTORTION_KEYS)} finite numbers, {' '.join(DISTORTION_KEYS)}"
+            raise FormatError(f"{where}: distortion_params: {expected}, got {brief(listed)}")
+        distortion |= dict(zip(DISTORTION_KEYS, numbers, strict=False))
+        for key in DISTORTION_KEYS:
+            if (number := transforms_number({}, level, key, where)) is not None:
+                distortion[key] = number
+    return distortion
 
 
 def _picture_path(transforms: Path, index: int, frame: dict[str, Any]) -> Path:

@@ -21,6 +21,7 @@ from vfr_bake.data.capture import PosedImages
 from vfr_bake.data.demo import demo_cameras
 from vfr_bake.data.files.opening import SUFFIXES
 from vfr_bake.data.files.pictures import read_picture, undistort
+from vfr_bake.data.folders import _distortion
 from vfr_bake.data.store.reading import PictureReader
 
 
@@ -468,6 +469,21 @@ def test_a_lens_that_is_not_a_number(tmp_path: Path):
     assert "frame 0 (./r_0): k1: expected a finite number, got '1'" in message(
         make_folder(tmp_path / "a", 3, k1="1"), FormatError
     )
+
+
+def test_distortion_in_the_list_of_nerfstudio(tmp_path: Path):
+    """A frame's numbers take precedence over those at the top, and named ones over a list."""
+    folder = make_folder(tmp_path / "a", 4, distortion_params=[0.1, 0.2, 0.3, 0.4, 0.5, 0.6], k2=0.7)
+    path = folder / "transforms.json"
+    edit(path, lambda d: d["frames"][1].update(distortion_params=[1, 2, 3, 4, 5, 6]))
+    edit(path, lambda d: d["frames"][2].update(k1=0, distortion_params=[1, 2, 3, 4, 5, 6]))
+    found = [list(_distortion(json.loads(path.read_text()), path, index).values()) for index in range(3)]
+    assert found == [[0.1, 0.7, 0.3, 0.4, 0.5, 0.6], [1, 2, 3, 4, 5, 6], [0, 2, 3, 4, 5, 6]]
+    for broken in ([0.1, 0.2], [0.1] * 5 + ["x"], "k1", {"k1": 0.1}):
+        edit(path, lambda d, broken=broken: d["frames"][3].update(distortion_params=broken))
+        assert "frame 3 (./r_3): distortion_params: expected 6 finite numbers, k1" in message(
+            folder, FormatError
+        )
 
 
 def test_without_opencv_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch):
