@@ -282,7 +282,7 @@ def _distortion(document: dict[str, Any], path: Path, index: int) -> dict[str, f
     `distortion_params`. A frame takes precedence over the top, and a name over a list. Raises FormatError."""
     frame = document["frames"][index]
     where = f"{path}: frame {index} ({frame['file_path']})"
-    distortion = dict.fromkeys(DISTORTION_KEYS, 0.0)
+    distortion: dict[str, float] = dict.fromkeys(DISTORTION_KEYS, 0.0)
     for level in (document, frame):
         listed = level.get("distortion_params") or []
         values = listed if isinstance(listed, list) else []
