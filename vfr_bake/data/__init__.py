@@ -75,13 +75,7 @@ def load_scene(
             why = read_record(model).why_without_camera()
     if scale is not None:
         capture = scaled(capture, *scale, why)
-    scene = build_scene(capture, kind)
-    if kind == "auto" and scene.masked and not capture.masked:
-        reader.say(
-            "less than half of the pictures have transparent pixels: these are masked, and the scene is "
-            "unbounded (--kind object for an object)"
-        )
-    return scene
+    return build_scene(capture, kind, reader.say)
 
 
 def working_size(config: TrainConfig) -> WorkingSize:

@@ -7,6 +7,7 @@ around what they look at, whatever the scene's unit is. `world_from_model` maps 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -68,9 +69,12 @@ class Scene:
     plain, else white."""
 
 
-def build_scene(capture: Capture, kind: SceneKind = "auto") -> Scene:
+def build_scene(
+    capture: Capture, kind: SceneKind = "auto", say: Callable[[str], object] = lambda text: None
+) -> Scene:
     """Build a `Scene` from pictures with cameras in the world: find its kind, and move the cameras to the
-    model frame, which the training views alone decide.
+    model frame, which the training views alone decide. `say`: called with a sentence if some pictures have
+    transparent pixels that are masked, or if those of an object show what is around it.
 
     Raises DataError if depth cannot be found (fewer than two training views, or all from one place), if
     nearly everything is masked, if all pictures are transparent, or if pictures of an object with transparent
@@ -122,6 +126,16 @@ def build_scene(capture: Capture, kind: SceneKind = "auto") -> Scene:
     has_alpha = has_alpha and not masked
     if masked:
         check_masked(capture.name, train.images)
+    if kind == "auto" and masked and not capture.masked:
+        say(
+            "less than half of the pictures have transparent pixels: these are masked, and the scene is "
+            "unbounded (--kind object for an object)"
+        )
+    if kind == "object" and mostly_opaque and plain is None and not masked:
+        say(
+            "the pictures show more than the object, which is trained in front of white: make them "
+            "transparent around it (--kind unbounded for all that they show)"
+        )
     return Scene(
         capture.name,
         moved(train),

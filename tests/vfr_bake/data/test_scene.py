@@ -105,6 +105,22 @@ def test_the_kind_of_scene_is_seen_and_can_be_overruled():
     assert build_scene(Capture("alpha", train, test), "unbounded").unbounded
 
 
+def test_an_object_whose_pictures_show_its_surroundings_is_told_of():
+    """Its pictures have to be transparent, masked or of one colour around it."""
+    train, test = demo_views(24, 10, 2)
+    around = opaque(train, None)
+    for views, masked, kind, n_lines in (
+        (around, False, "object", 1),
+        (around, False, "auto", 0),
+        (train, True, "object", 0),
+        (opaque(train, [51, 102, 204]), False, "object", 0),
+        (train, False, "object", 0),
+    ):
+        said: list[str] = []
+        build_scene(Capture("a", views, test, masked=masked), kind, said.append)
+        assert len(said) == n_lines and all("trained in front of white" in text for text in said)
+
+
 def test_a_dark_photograph_has_no_plain_background():
     """The border of pictures by night is within a few levels of black, and that of rendered ones is black."""
     train, test = demo_views(24, 10, 2)
