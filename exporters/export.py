@@ -86,7 +86,7 @@ def export_asset(
     if is_mesh:
         for path in itertools.chain.from_iterable(mesh_paths(target, options, name)):
             _check_target(asset_path, path, name, options.force)
-        check_packages(options, name)
+    check_packages(options, name)
     force = _check_target(asset_path, target, name, options.force)
     asset = Asset.open(asset_path, verify=True, max_memory=options.max_memory)
     # The mesh that the asset stores needs no densities, and bringing them to one level may take much memory.

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from exporters.extras import require_open3d
 from exporters.formats import glb, obj, ply, stl, usd
 from exporters.formats.parity import check_mesh_bytes, check_steps, check_textured_obj
 from exporters.mesh.paint import paint
@@ -62,8 +63,15 @@ def mesh_paths(target: Path, options: ExportOptions, name: str) -> list[list[Pat
 
 
 def check_packages(options: ExportOptions, name: str) -> None:
-    """Raise MissingExtraError if a package that only the last steps of an export need is not installed, so
-    that nobody waits for these in vain. `name` is one of `exporters.options.MESHES`."""
+    """Raise MissingExtraError if a package that only the last steps of a mesh or of points need is not
+    installed, so that nobody waits for these in vain. `name` is that of the format.
+
+    Whether a mesh with a texture needs Open3D is known only when its surface is made: it may have few faces.
+    """
+    asked = {"--faces": options.faces, "--lods": options.lods, "--method tsdf": options.method == "tsdf"}
+    for option, value in asked.items():
+        if value:
+            require_open3d(option)
     if options.texture is not None:
         require_xatlas()
     if name in ("usdc", "usda"):

@@ -142,6 +142,10 @@ def test_one_line_and_nothing_written(
         ("'a b.obj' --texture 64", "OBJ: name: expected one without spaces"),
         ("a.glb --texture 64", "--texture: needs xatlas: pip install 'vfr-bake[export]'"),
         ("a.usdc", "USD: needs usd-core: pip install 'vfr-bake[export]'"),
+        ("a.ply --faces 9", "--faces: needs open3d: pip install 'vfr-bake[export]'"),
+        ("a.ply --lods 2", "--lods: needs open3d: pip install 'vfr-bake[export]'"),
+        ("a.ply --method tsdf", "--method tsdf: needs open3d: pip install 'vfr-bake[export]'"),
+        ("a --format colmap --method tsdf", "--method tsdf: needs open3d"),
     ],
 )
 def test_what_the_last_step_would_refuse_is_refused_before_the_asset_is_opened(
@@ -152,7 +156,8 @@ def test_what_the_last_step_would_refuse_is_refused_before_the_asset_is_opened(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    monkeypatch.setitem(sys.modules, "pxr", None)
+    for module in ("open3d", "pxr"):
+        monkeypatch.setitem(sys.modules, module, None)
     name, *more = shlex.split(arguments)
     assert message in fails([str(tmp_path / "no asset"), str(tmp_path / name), *more], capsys)
 
