@@ -215,14 +215,17 @@ class _Bake:
             )
         if left_out is not None:
             self.left_out["cells"] = left_out
-        most, room = min(self._room_for_cells())
+        limits = list(self._room_for_cells())
+        most, room = min(limits)
         fitted = fit_cells(visible, plan.resolutions, most)
         unbounded, resolutions = model.field.config.unbounded, fitted.resolutions
-        if resolutions != plan.resolutions:
+        if resolutions == plan.resolutions:
+            _, room = limits[0]  # memory alone limits a plan
+        if resolutions != plan.wanted:
             self.left_out["resolution"] = (
                 f"{resolutions.densities} cells along an axis for densities, {resolutions.features} for "
-                f"features, in place of {plan.resolutions.densities} and {plan.resolutions.features}: more "
-                f"do not fit into {room}; part of the loss after 'grid'"
+                f"features, in place of {plan.wanted.densities} and {plan.wanted.features}: more do not fit "
+                f"into {room}; part of the loss after 'grid'"
             )
             step = lattice_step(resolutions.densities) if unbounded else step
         near = 0.0 if isinstance(model.sampler, OccupancyGrid) else model.sampler.near

@@ -107,6 +107,8 @@ class Plan:
     """Sizes chosen for the memory allowed, and the memory that the bake is expected to take."""
 
     resolutions: Resolutions
+    wanted: Resolutions
+    """What the resolutions would be if there were memory for the marks of any number of cells."""
     n_cells: float
     """Cells of the features' grid that are expected to be stored."""
     cell_bytes: float
@@ -158,19 +160,21 @@ def make_plan(model: Model, config: BakeConfig) -> Plan:
             f"bake: size: expected at most {config.max_mb:g} MB, got {np.ceil(100 * least) / 100:.2f} MB for "
             f"{len(model.cameras)} cameras and the head alone: nothing was written: allow more"
         )
-    resolutions = _resolutions(model, config)
+    room = config.memory * 1e9 - PROGRAM_BYTES
+    mark_bytes = _marks_bytes(model, config)
+    wanted = _resolutions(model, config, np.inf)
+    resolutions = _resolutions(model, config, int(np.cbrt(max(room, 0) / mark_bytes)))
     fine, coarse = resolutions
-    marks = _marks_bytes(model, config) * coarse**3
+    marks = mark_bytes * coarse**3
     n_channels = min(choice.n_channels, field.n_channels)
     cell_bytes = CHANNEL_BYTES * n_channels + 60
     cell_bytes += DENSITY_BYTES * (fine / coarse) ** 3
-    room = config.memory * 1e9 - PROGRAM_BYTES
     given = config.resolution or config.feature_resolution
     page_cells = np.inf if given else cells_of_page(choice.page_mb, n_channels, (fine / coarse) ** 3)
     drawn = max(int(RAYS_OF_DRAW * choice.refine_steps * BATCH), FEW_DRAWN)
     most_rays = min(UNBOUNDED_RAYS if field.unbounded else N_RAYS, drawn)
     n_cells = _cells(model, coarse)
-    plan = Plan(resolutions, n_cells, cell_bytes, field.unbounded, room, marks, page_cells, most_rays)
+    plan = Plan(resolutions, wanted, n_cells, cell_bytes, field.unbounded, room, marks, page_cells, most_rays)
     plan = replace(plan, n_cells=min(plan.n_cells, max(plan.most_cells, 0), page_cells))
     if plan.most_cells <= 0 or marks > room:
         least = PROGRAM_BYTES + max(marks, FEWEST_RAYS * plan.ray_bytes)
@@ -193,7 +197,9 @@ def _fixed_bytes(model: Model, config: BakeConfig) -> int:
     return len(write_cameras(model.cameras)) + n_layers * width**2 * choice.head_bits // 8
 
 
-def _resolutions(model: Model, config: BakeConfig) -> Resolutions:
+def _resolutions(model: Model, config: BakeConfig, most: float) -> Resolutions:
+    """Return the resolutions to bake at; unless they are given, with at most `most` feature cells per
+    axis."""
     choice, field = config.choice(model.field.config.unbounded), model.field.config
     if config.resolution:
         resolution = config.resolution
@@ -201,10 +207,8 @@ def _resolutions(model: Model, config: BakeConfig) -> Resolutions:
         resolution = choice.contracted_resolution
     else:
         resolution = round(2 * choice.cells_per_pixel / float(np.median(pixel_footprints(model))))
-    room = max(config.memory * 1e9 - PROGRAM_BYTES, 0)
-    most = int(np.cbrt(room / _marks_bytes(model, config)))  # feature cells per axis whose marks fit
     if not config.resolution:
-        resolution = min(resolution, int(most / choice.feature_share))
+        resolution = min(resolution, most / choice.feature_share)
     resolution = int(np.clip(resolution, 8, 3 * field.max_resolution // 2))
     coarse = config.feature_resolution or round(choice.feature_share * resolution)
     if not (config.resolution or config.feature_resolution):

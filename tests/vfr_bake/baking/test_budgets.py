@@ -21,7 +21,7 @@ from player.progress import silent
 from tests.exporters.meshes import read_ply
 from vfr_bake.baking import mesh as baked_mesh
 from vfr_bake.baking.bake import _Bake, bake
-from vfr_bake.baking.cells import FLOORS
+from vfr_bake.baking.cells import FLOORS, Resolutions
 from vfr_bake.baking.grids import Layout
 from vfr_bake.baking.limits import file_sizes, keep_to_time
 from vfr_bake.baking.mesh import bake_mesh
@@ -267,6 +267,18 @@ def test_a_grid_that_memory_limits_is_not_refused(
         gigabytes = (PROGRAM_BYTES + (CULLING_BYTES + len(FLOORS)) * n_cells**3) / 1e9
         plan = make_plan(model, BakeConfig(preset=preset, max_memory=gigabytes))
         assert plan.resolutions.features <= n_cells and plan.resolutions.densities < wanted.densities
+        assert plan.wanted == wanted
+
+
+def test_a_grid_that_the_plan_made_coarser_is_reported(model: Model) -> None:
+    """Memory limits the plan of a bake, before anything is found that limits its grids."""
+    work = _Bake(model, BakeConfig(check_views=1), silent)
+    wanted = work.plan.resolutions
+    work.plan = replace(work.plan, resolutions=Resolutions(40, 30))
+    work._cells()
+    assert work.left_out["resolution"].startswith("40 cells along an axis for densities, 30 for features")
+    assert f"in place of {wanted.densities} and {wanted.features}: more do not" in work.left_out["resolution"]
+    assert f"into {work.config.memory:.3g} GB of memory;" in work.left_out["resolution"]
 
 
 def test_a_mesh_that_takes_too_much_memory_is_left_out(model: Model, tmp_path: Path) -> None:
