@@ -20,10 +20,9 @@ def bake_command(options: Any) -> int:
     check_asset_target(options.asset, options.force)
     check_json_target(options.json, [options.model], options.asset)
     if (options.config.max_memory or 0) > (there := available_bytes() / 1e9):
-        print(
-            f"vfr-bake: warning: --max-memory {options.config.max_memory:g} is more than the {there:.1f} GB "
-            "that there are: the system may end the bake",
-            file=sys.stderr,
+        _say(
+            f"warning: --max-memory {options.config.max_memory:g} is more than the {there:.1f} GB "
+            "that there are: the system may end the bake"
         )
     if options.convert:
         return _convert(options)
@@ -39,13 +38,12 @@ def bake_command(options: Any) -> int:
     fine, coarse = plan.resolutions
     first = f", {COMPILE_SECONDS:.0f} s of them to compile its code for the first time,"
     compiling = "" if is_compiled() else first
-    print(
-        f"vfr-bake: about {max(minutes, 0.1):.1f} minutes{compiling} and {plan.n_bytes / 1e9:.1f} GB of "
+    _say(
+        f"about {max(minutes, 0.1):.1f} minutes{compiling} and {plan.n_bytes / 1e9:.1f} GB of "
         f"memory ({options.config.memory:.3g} GB at most), densities on at most {fine} cells per axis and "
-        f"features on {coarse}, about {plan.n_rays(plan.n_cells):,} rays to learn from",
-        file=sys.stderr,
+        f"features on {coarse}, about {plan.n_rays(plan.n_cells):,} rays to learn from"
     )
-    prove(lambda text: print(f"vfr-bake: {text}", file=sys.stderr))  # the bake will play the asset at its end
+    prove(_say)  # the bake will play the asset at its end
     with Bars() as bars:
         result = bake(model, options.asset, options.config, bars.count, options.force)
     megabytes = result.n_bytes / 1e6
@@ -59,14 +57,17 @@ def bake_command(options: Any) -> int:
         f"against photographs: see {options.asset / 'report.html'}",
     )
     if result.loss.spread is None:
-        print(
-            "vfr-bake: the model has no witnesses (docs/train.md), so that the loss is estimated from its "
-            "own pictures: train again to have it measured against photographs",
-            file=sys.stderr,
+        _say(
+            "the model has no witnesses (docs/train.md), so that the loss is estimated from its "
+            "own pictures: train again to have it measured against photographs"
         )
     for missed in result.missed:
-        print(f"vfr-bake: warning: {missed}: see report.html for where it goes", file=sys.stderr)
+        _say(f"warning: {missed}: see report.html for where it goes")
     return 0
+
+
+def _say(text: str) -> None:
+    print(f"vfr-bake: {text}", file=sys.stderr)
 
 
 def _convert(options: Any) -> int:

@@ -49,7 +49,7 @@ def train_command(options: Any) -> int:
     if options.check:
         return _check(options)
     if options.model is None:
-        print("vfr-train: expected a model file to write, or --check; see vfr-train --help", file=sys.stderr)
+        _say("expected a model file to write, or --check; see vfr-train --help")
         return 2
     checkpoint = checkpoint_path(options.model)
     goes_on = options.resume and checkpoint.exists()
@@ -58,13 +58,13 @@ def train_command(options: Any) -> int:
     config = options.config
     processes = Processes.from_environment()
     if options.resume and not goes_on and processes.first:
-        print(f"vfr-train: {checkpoint}: no such checkpoint: training begins anew", file=sys.stderr)
+        _say(f"{checkpoint}: no such checkpoint: training begins anew")
     # The pictures of a ZIP or a video can be looked at only once they are unpacked.
     packed = not Path(options.data).is_dir()
     glance = _glance(options.data, config) if processes.first and not packed else None
     # Masks of no picture are found when cameras are estimated, and again when the pictures are read. What has
     # been said is kept, and is not said again.
-    say = cache(partial(_say, options.data))
+    say = cache(partial(_tell, options.data))
     data = processes.in_turn(lambda: _with_cameras(options.data, say, config.scale))
     if processes.first and packed:
         glance = _glance(data, config)
@@ -84,7 +84,7 @@ def train_command(options: Any) -> int:
     if goes_on:
         load_checkpoint(checkpoint, trainer)
         if processes.first:
-            print(f"vfr-train: going on after step {trainer.next_step}", file=sys.stderr)
+            _say(f"going on after step {trainer.next_step}")
     preview = _preview(options, scene) if options.preview and processes.first else None
     figures = _train_steps(trainer, checkpoint, preview)
     figures["blurred"] = blurred
@@ -132,13 +132,13 @@ def _finish(options: Any, trainer: Trainer, scene: Scene, figures: dict[str, Any
         except KeyboardInterrupt:
             why = f"interrupted twice: {checkpoint} is not written anew"
         why = why or f"interrupted: the same command with --resume goes on; {checkpoint} is kept for it"
-        print(f"vfr-train: {printable(why)}", file=sys.stderr)
+        _say(printable(why))
     else:
         checkpoint.unlink(missing_ok=True)
         if stopped:
-            print("vfr-train: interrupted: the model is complete, but not measured", file=sys.stderr)
+            _say("interrupted: the model is complete, but not measured")
     for line in [*trainer.effects.described(), *(witnesses.lines() if witnesses else ())]:
-        print(f"vfr-train: {line}", file=sys.stderr)
+        _say(line)
     _report_training(options, figures, interrupted)
     return stopped
 
@@ -178,7 +178,7 @@ def _glance(data: str, config: TrainConfig) -> Callable[[], None] | None:
 
     def say() -> None:
         for line in check.lines():
-            _say(data, line)
+            _tell(data, line)
 
     if check.verdict == BAD:
         return say
@@ -186,8 +186,12 @@ def _glance(data: str, config: TrainConfig) -> Callable[[], None] | None:
     return None
 
 
-def _say(data: str, text: str) -> None:
-    print(f"vfr-train: {printable(f'{data}: {text}')}", file=sys.stderr)
+def _say(text: str) -> None:
+    print(f"vfr-train: {text}", file=sys.stderr)
+
+
+def _tell(data: str, text: str) -> None:
+    _say(printable(f"{data}: {text}"))
 
 
 def _with_cameras(
@@ -208,7 +212,7 @@ def _with_cameras(
     if not needs_cameras(data):
         if added := added_since(folder):
             named = ", ".join(added[:3]) + (", ..." if len(added) > 3 else "")
-            _say(
+            _tell(
                 data,
                 f"pictures that were added after the cameras were estimated are not used: {len(added)} "
                 f"({named}): remove {folder / 'sparse'} to use them",
@@ -218,9 +222,9 @@ def _with_cameras(
         check_scale(folder, scale)
     with Bars() as bars:
         report = estimate_cameras(Path(data), bars.count, say)
-    print(f"vfr-train: {printable(report.summary())}", file=sys.stderr)
+    _say(printable(report.summary()))
     for name, reason in report.unplaced.items():
-        print(f"vfr-train:   no place for {printable(name)}: {printable(reason)}", file=sys.stderr)
+        _say(f"  no place for {printable(name)}: {printable(reason)}")
     return data if report.folder == folder else str(report.folder)
 
 
@@ -231,10 +235,9 @@ def _without_blurred(scene: Scene, processes: Processes) -> tuple[Scene, list[st
     with Bar("looking for blur", processes.first) as bar:
         train, names = without_blurred(scene.train, bar.count)
     if names and processes.first:
-        print(
-            f"vfr-train: {len(names)} of {len(scene.train.cameras)} training pictures are blurred, compared "
-            f"with the others, and left out: {printable(', '.join(names))}",
-            file=sys.stderr,
+        _say(
+            f"{len(names)} of {len(scene.train.cameras)} training pictures are blurred, compared "
+            f"with the others, and left out: {printable(', '.join(names))}"
         )
     return replace(scene, train=train), names
 
@@ -248,11 +251,10 @@ def _warn_of_folds(scene: Scene) -> None:
         return
     if torn:
         named = printable(", ".join(f"{first} and {second}" for first, second in torn))
-        print(
-            f"vfr-train: {printable(str(scene.name))}: {named} match, but their cameras are far apart: the "
+        _say(
+            f"{printable(str(scene.name))}: {named} match, but their cameras are far apart: the "
             "subject seems to look the same from several sides, and its cameras are folded. Train on a "
-            "folder of the pictures alone to have the cameras estimated anew",
-            file=sys.stderr,
+            "folder of the pictures alone to have the cameras estimated anew"
         )
 
 
@@ -261,7 +263,7 @@ def _preview(options: Any, scene: Scene) -> Preview:
 
     path = preview_path(options.model)
     check_target(path, options.force or options.resume, is_file=True)
-    print(f"vfr-train: look at {printable(str(path))}, new every minute", file=sys.stderr)
+    _say(f"look at {printable(str(path))}, new every minute")
     return Preview(scene, path)
 
 
@@ -303,15 +305,14 @@ def _train_steps(trainer: Trainer, checkpoint: Path, preview: Preview | None) ->
                 why = _unsaved(checkpoint, trainer)
                 if why and not told:
                     bar.close()
-                    print(f"vfr-train: {printable(why)}: training goes on without it", file=sys.stderr)
+                    _say(f"{printable(why)}: training goes on without it")
                     told = True
                 saved = time.monotonic()
     interrupted = interrupted or ctrl_c.pressed  # after the last step
     if n_steps and not trainer.head_learns and trainer.processes.first:
-        print(
-            "vfr-train: the training has ended in its first steps, which teach the pilot network alone: the "
-            "model shows random colours: train longer",
-            file=sys.stderr,
+        _say(
+            "the training has ended in its first steps, which teach the pilot network alone: the "
+            "model shows random colours: train longer"
         )
     if preview is not None:
         preview.write(trainer)
@@ -348,7 +349,7 @@ def _expect(trainer: Trainer, seconds_a_step: float, bar: Bar) -> None:
         unbounded = trainer.field.config.unbounded
         length = trainer.pace.steps, trainer.minutes
         text = expectation(psnr.every, trainer.seconds, seconds_a_step, *length, unbounded)
-        print(f"vfr-train: {text}", file=sys.stderr)
+        _say(text)
 
 
 def _report_training(options: Any, figures: dict[str, Any], interrupted: bool) -> None:
@@ -371,7 +372,7 @@ def _test_figures(model: Model, scene: Scene, n_views: int, most_seconds: float)
     with Bar("test views") as bar:
         scores, lines = quick_psnr(model, scene, n_views, most_seconds, bar.count)
     for line in lines:
-        print(f"vfr-train: {line}", file=sys.stderr)
+        _say(line)
     return {
         **finite({"test_psnr": sum(scores) / len(scores) if scores else None}),
         "test_views": len(scores),
