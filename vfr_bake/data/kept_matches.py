@@ -29,7 +29,7 @@ import numpy as np
 
 from vfr_bake.data.features import MAX_FEATURES, Features
 
-VERSION = b"4"
+VERSION = b"5"
 """Version of the records. It changes whenever the same picture would give other features or matches."""
 SIDE = 32
 """Pixels along a side of a thumbnail."""

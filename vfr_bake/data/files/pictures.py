@@ -16,7 +16,7 @@ from player.files.images import MAX_FILE_BYTES
 from vfr_bake.data.capture import PosedImages
 from vfr_bake.data.files.opening import open_photograph
 from vfr_bake.data.files.orientation import as_stored, layout_of, read_layout, turned_upright
-from vfr_bake.data.files.profiles import as_srgb
+from vfr_bake.data.files.profiles import as_srgb, coded_profile
 
 SHARPNESS_SIDE = 800
 """Pixels of the longest side at which sharpness is measured. Blur that does not show at this size is below
@@ -24,6 +24,8 @@ two pixels at the working size."""
 
 BYTES_DECODED = 16
 """Bytes of memory for each decoded pixel while its picture is read."""
+HEADER_BYTES = 1 << 16
+"""Bytes at the beginning of a HEIC or AVIF file, at most, in which its colours are named."""
 
 
 class DescribedView(NamedTuple):
@@ -143,7 +145,7 @@ def read_picture(path: Path, upright: bool = False, least: tuple[int, int] | Non
                 swapped = upright != layout.turned and layout.number >= 5
                 file.draft(None, (least[1], least[0]) if swapped else least)
             rgba = _read_16_bit_colour(path) if _is_16_bit_colour(path) else _decoded(path, file)
-            rgba = as_srgb(rgba, file.info.get("icc_profile"))
+            rgba = as_srgb(rgba, file.info.get("icc_profile") or _coded_profile(path, file))
     except FormatError as error:
         raise DataError(str(error)) from error
     if layout.turned == upright:
@@ -162,6 +164,14 @@ def _decoded(path: Path, file: Image.Image) -> np.ndarray:
     if file.mode == "F":
         raise DataError(f"{path}: picture: expected 8 or 16 bits a channel, got floating point")
     return np.asarray(file.convert("RGBA"))
+
+
+def _coded_profile(path: Path, file: Image.Image) -> bytes | None:
+    """Return the colour profile that a HEIC or AVIF picture names by a code; None if it names none."""
+    if file.format not in ("HEIF", "AVIF"):
+        return None
+    with open_file(path, "a picture", MAX_FILE_BYTES) as header:
+        return coded_profile(header.read(HEADER_BYTES))
 
 
 def _is_16_bit_colour(path: Path) -> bool:

@@ -30,7 +30,7 @@ from vfr_bake.data.files.pictures import DescribedView
 from vfr_bake.data.store.stored import StoreLayout, map_pictures
 from vfr_bake.data.store.working import WorkingSize
 
-VERSION = 2
+VERSION = 4
 MOST_BYTES = 64_000_000_000
 """Bytes that all sets may take together; the sets that were not used for longest are removed first."""
 GRACE = 600.0

@@ -96,27 +96,44 @@ DISPLAY_P3 = [(0.51512, 0.2412, -0.00105), (0.29198, 0.69225, 0.04189), (0.1571,
 SRGB = [(0.43607, 0.22249, 0.01392), (0.38515, 0.71687, 0.09708), (0.14307, 0.06061, 0.71410)]
 
 
-@pytest.mark.parametrize("suffix", [".png", ".jpg", ".webp", ".tif"])
-def test_colours_of_another_profile_become_srgb(suffix: str, tmp_path: Path) -> None:
-    """The same colours, written as Display P3 and as sRGB, are read as the same picture."""
-    random = np.random.default_rng(0)
-    linear = random.uniform(0.05, 0.6, (4, 5, 3))
+def in_p3_and_srgb() -> tuple[Image.Image, np.ndarray]:
+    """Return a picture whose numbers are Display P3, and the same colours in sRGB, [height, width, 3] int."""
+    linear = np.random.default_rng(0).uniform(0.05, 0.6, (4, 5, 3))
     to_p3 = np.linalg.solve(np.array(DISPLAY_P3).T, np.array(SRGB).T)
 
     def encoded(colours: np.ndarray) -> np.ndarray:
         values = np.where(colours <= 0.0031308, 12.92 * colours, 1.055 * colours ** (1 / 2.4) - 0.055)
         return np.rint(255 * values.clip(0, 1)).astype(np.uint8).repeat(16, axis=0).repeat(16, axis=1)
 
+    return Image.fromarray(encoded(linear @ to_p3.T)), encoded(linear).astype(int)
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg", ".webp", ".tif"])
+def test_colours_of_another_profile_become_srgb(suffix: str, tmp_path: Path) -> None:
+    """The same colours, written as Display P3 and as sRGB, are read as the same picture."""
+    wide, srgb = in_p3_and_srgb()
     lossless = {"lossless": True} if suffix == ".webp" else {"quality": 100, "subsampling": 0}
     path = tmp_path / f"a{suffix}"
-    wide = Image.fromarray(encoded(linear @ to_p3.T))
     wide.save(path, icc_profile=profile_like(DISPLAY_P3), **lossless)
     read = read_picture(path).astype(int)
     assert (read[..., 3] == 255).all()
-    assert np.abs(read[8::16, 8::16, :3] - encoded(linear)[8::16, 8::16]).max() <= (
-        4 if suffix == ".jpg" else 2
-    )
-    assert np.abs(np.asarray(wide).astype(int) - encoded(linear)).max() > 8, "profiles would not matter"
+    assert np.abs(read[..., :3] - srgb)[8::16, 8::16].max() <= (4 if suffix == ".jpg" else 2)
+    assert np.abs(np.asarray(wide).astype(int) - srgb).max() > 8, "profiles would not matter"
+
+
+@pytest.mark.parametrize("suffix", [".heic", ".avif"])
+def test_colours_that_a_file_names_by_a_code_become_srgb(suffix: str, tmp_path: Path) -> None:
+    """A HEIC or AVIF picture may name Display P3 by a number in place of a profile."""
+    wide, srgb = in_p3_and_srgb()
+    path = tmp_path / f"a{suffix}"
+    wide.save(path, quality=100, chroma=444, subsampling="4:4:4")
+    data, code = path.read_bytes(), b"colrnclx\0"
+    place = data.index(code) + len(code)
+    path.write_bytes(data[:place] + b"\x0c" + data[place + 1 :])
+    read = read_picture(path).astype(int)[..., :3]
+    assert np.abs(read - srgb)[8::16, 8::16].max() <= 4
+    path.write_bytes(data[:place] + b"\1" + data[place + 1 :])
+    assert np.abs(read_picture(path)[..., :3] - srgb)[8::16, 8::16].max() > 8, "it is taken as sRGB"
 
 
 def test_a_picture_in_srgb_is_read_bit_for_bit(tmp_path: Path) -> None:
