@@ -21,6 +21,12 @@ LIMITS: dict[str, tuple[Any, Any, Any, Any]] = {
     "density_range": ((-80.5, 1), (-80, 1), (0, 80), (0, 80.5)),
     "background": ((-0.01, 0, 0), (0, 0, 0), (1, 1, 1), (1, 1, 1.01)),
     "view_size": ((0, 1), (1, 1), (2**20, 2**20), (1, 2**20 + 1)),
+    "aabb": (
+        ((-1001,) * 3, (-1000, 0, 0)),
+        ((-1000,) * 3, (-999, 0, 0)),
+        ((0, 0, 999), (1e3, 1e3, 1000)),
+        ((0, 0, 1000), (1e3, 1e3, 1001)),
+    ),
     "step": (0.9e-9, 1e-4, 1e9, 1.1e9),
 }
 """By key: a value below the limits, the least and the greatest accepted, and one above the limits, as in
