@@ -96,7 +96,7 @@ gigabytes = number("gigabytes", "4", above=0, most=1e9)
 
 
 def size(text: str) -> tuple[int, int]:
-    """Read a width and a height.
+    """Read a width and a height, up to a million pixels each.
 
     >>> size("800x600")
     (800, 600)
@@ -105,8 +105,8 @@ def size(text: str) -> tuple[int, int]:
         width, height = (int(part) for part in text.lower().split("x"))
     except ValueError:
         width = height = 0
-    if width < 1 or height < 1:
-        raise wrong("WIDTHxHEIGHT, from 1x1 on", "800x600", text)
+    if not (1 <= width <= 1_000_000 and 1 <= height <= 1_000_000):
+        raise wrong("WIDTHxHEIGHT, 1 to 1000000 each", "800x600", text)
     return width, height
 
 

@@ -114,7 +114,10 @@ def test_a_size_of_nothing_and_one_for_a_warehouse(
 ) -> None:
     views = [str(shells_folder), "--view", "0", "--output", str(tmp_path / "o")]
     assert cli.main([*views, "--size", "0x0"]) == 2
-    assert "--size: expected WIDTHxHEIGHT, from 1x1 on, such as 800x600, got '0x0'" in capsys.readouterr().err
+    assert (
+        "--size: expected WIDTHxHEIGHT, 1 to 1000000 each, such as 800x600, got '0x0'"
+        in capsys.readouterr().err
+    )
     assert cli.main([*views, "--size", "20000x20000"]) == 1
     refused(capsys, tmp_path / "o", "expected at most 67108864 pixels (8192x8192)", "12.0 GB of memory")
     # a large size that is allowed is reported before rendering starts, which is prevented here

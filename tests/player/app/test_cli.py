@@ -278,7 +278,11 @@ def test_check_looks_into_files_whose_checksums_hold(
         ),
         (["--orbit", "3", "--output", "o.mp4", "--fps", "inf"], "a number, such as 30, got 'inf'"),
         (["--orbit", "3", "--output", "o.mp4", "--background", "transparent"], "a video has no transparency"),
-        (["--orbit", "3", "--output", "o", "--size", "0x0"], "from 1x1 on, such as 800x600, got '0x0'"),
+        (["--orbit", "3", "--output", "o", "--size", "0x0"], "1 to 1000000 each, such as 800x600, got '0x0'"),
+        (
+            ["--orbit", "3", "--output", "o", "--size", "9" * 320 + "x64"],
+            "1 to 1000000 each, such as 800x600",
+        ),
         (["--view", "x", "--output", "o"], "expected a whole number, such as 3, got 'x'"),
         (["--output", "o"], "--output: add the views"),
         (["--orbit", "0", "--output", "o"], "--orbit"),

@@ -187,7 +187,7 @@ def test_against_the_full_model(
     [
         (["--views", "0"], "views: expected at least 1, got 0"),
         (["--frames", "1"], "frames: expected at least 2, got 1"),
-        (["--sizes", "0x5"], "sizes: expected WIDTHxHEIGHT, from 1x1 on, such as 800x600, got '0x5'"),
+        (["--sizes", "0x5"], "sizes: expected WIDTHxHEIGHT, 1 to 1000000 each, such as 800x600, got '0x5'"),
         (["--samples", "-3"], "samples: expected 0 to 1024, got [-3]"),
         (["--threads", "0"], "threads: expected at least 1, got 0"),
     ],
