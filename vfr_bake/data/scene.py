@@ -23,7 +23,7 @@ from vfr_bake.data.world import MOST_POINTS
 BORDER = 2
 """Width in pixels of the border of a picture that is examined for a plain background."""
 PLAIN_SHARE, PLAIN_LEVELS = 0.95, 8
-"""A background is plain if at least PLAIN_SHARE of the border pixels are within PLAIN_LEVELS of one
+"""A background is plain if at least PLAIN_SHARE of the opaque border pixels are within PLAIN_LEVELS of one
 colour."""
 DARK = 16
 """A colour whose levels are no higher than this, half a percent of white's light, does not tell of an object
@@ -176,13 +176,17 @@ def evenly(n_views: int, n_chosen: int) -> np.ndarray:
 
 
 def _plain_border(views: PosedImages, exact_if_dark: bool) -> tuple[float, float, float] | None:
-    """Return the colour of the pictures' borders, sRGB in [0, 1]; None if they show more than one colour.
-    `exact_if_dark`: whether the pixels of a DARK border have to be exactly equal."""
+    """Return the colour of the pictures' borders where these are opaque, sRGB in [0, 1]; None if they show
+    more than one colour, or if less than half of them is opaque. `exact_if_dark`: whether the pixels of a
+    DARK border have to be exactly equal."""
     edges = [
-        views.pixels(number, _border(camera.width, camera.height))[:, :3]
+        views.pixels(number, _border(camera.width, camera.height))
         for number, camera in enumerate(views.cameras)
     ]
-    pixels = np.concatenate(edges).astype(np.int16)
+    rgba = np.concatenate(edges)
+    pixels = rgba[rgba[:, 3] == 255, :3].astype(np.int16)
+    if 2 * len(pixels) < len(rgba):
+        return None
     colour = np.median(pixels, axis=0).round()
     levels = 0 if exact_if_dark and colour.max() <= DARK else PLAIN_LEVELS
     if (np.abs(pixels - colour).max(axis=1) <= levels).mean() < PLAIN_SHARE:

@@ -121,6 +121,22 @@ def test_an_object_whose_pictures_show_its_surroundings_is_told_of():
         assert len(said) == n_lines and all("trained in front of white" in text for text in said)
 
 
+@pytest.mark.parametrize("colour", [None, [51, 102, 204]])
+def test_masked_borders_say_nothing_of_the_background(colour: list[int] | None):
+    """What is masked may have any colour, and is black once pictures have been made smaller. The background
+    is the colour of the other pixels of the borders, if these are at least half of all."""
+    train, test = demo_views(24, 10, 2)
+    views = opaque(train, colour)
+    for image in views.images:
+        image[:10] = 0
+    scene = build_scene(Capture("a", views, test, masked=True))
+    assert scene.unbounded == (colour is None)
+    assert scene.background == (WHITE if colour is None else pytest.approx([0.2, 0.4, 0.8]))
+    for image in views.images:
+        image[:2] = image[-2:] = image[:, :2] = image[:, -2:] = 0
+    assert build_scene(Capture("a", views, test, masked=True)).unbounded
+
+
 def test_a_dark_photograph_has_no_plain_background():
     """The border of pictures by night is within a few levels of black, and that of rendered ones is black."""
     train, test = demo_views(24, 10, 2)
