@@ -70,9 +70,9 @@ def export_asset(
 
     Raises:
         ConfigError: an unknown suffix, a setting that does nothing or is out of range, an empty crop, an
-            asset that takes more memory than it may, a page that takes more graphics memory or has more
-            channels than browsers can draw, two files with the same name, or a mesh or points so far from
-            the origin that float32 would deform them.
+            asset or a picture that takes more memory than it may, a page that takes more graphics memory or
+            has more channels than browsers can draw, two files with the same name, or a mesh or points so far
+            from the origin that float32 would deform them.
         DataError: there is no surface.
         OutputError: the target exists and `force` is not set, or cannot be written.
         FormatError: the asset, its mesh or a file of cameras is damaged.
@@ -98,8 +98,9 @@ def export_asset(
         facts = export_mesh(asset, target, options, name, matrix, report)
     elif name == "exr":
         cameras, names = _views(asset, options)
+        progress = partial(report, "picture")
         facts = export_pictures(
-            asset, target, cameras, names, options.half, force, partial(report, "picture")
+            asset, target, cameras, names, options.half, force, options.max_memory, progress
         )
     elif name in ("html", "web"):
         facts = export_page(asset, target, name, options.max_gpu_mb, force)

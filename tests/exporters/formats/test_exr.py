@@ -178,6 +178,10 @@ def test_no_places_where_float32_cannot_hold_them(shells_asset: Path, tmp_path: 
         (["--views", "7:9"], "--views: expected at least one view, got none"),
         (["--cameras", "none.json"], "none.json: no such file"),
         (["--size", "9000x9000"], "size: expected at most"),
+        (
+            ["--size", "1000x800", "--max-memory", "0.2"],
+            "frames: a picture: memory: expected at most 0.2 GB, got 0.21 GB or more",
+        ),
         (["--frame", "gltf"], "--frame does nothing for exr"),
     ],
 )
