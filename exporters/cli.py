@@ -13,7 +13,6 @@ from typing import Any, get_args
 from exporters.options import FOLDERS, FORMATS, POINTS, Coordinates, ExportOptions, Method
 from player.app.commands import run
 from player.app.option_types import gigabytes, joined_negatives, number, part, size, whole
-from player.app.options import MAX_MEMORY
 from player.progress import Bars
 
 _DESCRIPTION = """\
@@ -116,7 +115,8 @@ def make_parser() -> argparse.ArgumentParser:
     _value(parser, "--format", "NAME", "exr, colmap or web for a folder; or a suffix without its dot")
     add("--frame", choices=get_args(Coordinates), help="coordinates (world); see below")
     add("--force", action="store_true", help="replace FILE if it exists")
-    _value(parser, "--max-memory", "GB", MAX_MEMORY, type=gigabytes)
+    memory = "gigabytes of memory that the asset may take, or a picture of EXR (half of the machine's)"
+    _value(parser, "--max-memory", "GB", memory, type=gigabytes)
     add("--json", action="store_true", help="print the summary as one line of JSON")
     _add_shapes(parser.add_argument_group("meshes, points and volumes"))
     _add_pictures(parser.add_argument_group("pictures and cameras"))

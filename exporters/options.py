@@ -109,7 +109,7 @@ class ExportOptions:
     force: bool = False
     """Replace what is there."""
     max_memory: float | None = None
-    """Gigabytes that the asset may take when it is opened; a share of the machine's if None."""
+    """Gigabytes that the asset may take, or a picture of EXR; a share of the machine's if None."""
 
     @property
     def coordinates(self) -> Coordinates:
