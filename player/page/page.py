@@ -57,9 +57,10 @@ _ADVICE_OF_MANY_FILES = (
 )
 # Inline, because a page on a disk may load no script. It waits for the error event and not for a time, so
 # that a slow line is not taken for a script that cannot run; it comes before the element, to miss no event.
+# The window itself is the event's target where the script arrives, but cannot be parsed, linked or run.
 _WATCH = """\
 addEventListener("error", ({ target }) => {
-  if (target.id !== "script") return;
+  if (target.id !== "script" && (target !== window || window.vfr)) return;
   document.body.classList.add("failed");
   document.getElementById("status").textContent = document.querySelector("noscript").textContent;
 }, true);
@@ -169,9 +170,19 @@ def page_of_many_files(asset: Asset, title: str | None = None, max_gpu_mb: int =
     }
     sources[INDEX] = _filled(sources[INDEX], filled)
     sources[STYLE] += _behind(asset)
+    poster = poster_bytes(asset)
+    sources = _with_version(sources, poster)
     viewer = {name: _ascii_html(text) if name == INDEX else text.encode() for name, text in sources.items()}
-    files = {**viewer, POSTER: poster_bytes(asset), **scene_files(asset)}
+    files = {**viewer, POSTER: poster, **scene_files(asset)}
     return WebPage(files, sum(map(len, viewer.values())), n_gpu)
+
+
+def _with_version(sources: Mapping[str, str], poster: bytes) -> dict[str, str]:
+    """Return the files of a folder with a version, which depends on all of them, behind the address of each
+    module, the style and the poster: a browser may have kept files of a folder that was exported before."""
+    version = hashlib.sha256("".join(sources.values()).encode() + poster).hexdigest()[:8]
+    address = re.compile(r'"((?:\./)?\w+\.(?:js|css|jpg))"')
+    return {name: address.sub(rf'"\1?v={version}"', text) for name, text in sources.items()}
 
 
 def is_site_file(name: str) -> bool:

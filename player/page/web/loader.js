@@ -34,11 +34,12 @@ export async function* loadScene(onProgress) {
   const nParts = manifest.parts.length;
   const total = manifest.parts.reduce((sum, part) => sum + manifest.files[part.file].bytes, 0);
   const done = { there: isFile ? total : 0, decoded: 0 };
-  const tell = () => onProgress({ done: done.there + done.decoded, total: 2 * total });
+  const end = new AbortController(), { signal } = end;
+  const tell = () => signal.aborted || onProgress({ done: done.there + done.decoded, total: 2 * total });
   const get = async (name) => (isFile ? { text: textInPage(name) } : { bytes: await fetched(name, manifest.files[name], (n) => {
     if (name.startsWith("part_")) done.there += n;
     tell();
-  }) });
+  }, signal) });
   const small = async (name) => checkedFile(name, await get(name), manifest.files[name]);
   const cameras = JSON.parse(new TextDecoder().decode(await small("cameras.json")));
   const head = headOf(JSON.parse(new TextDecoder().decode(await small("head.json"))), await small("head.bin"));
@@ -81,6 +82,7 @@ export async function* loadScene(onProgress) {
       yield scene;
     }
   } finally {
+    end.abort();
     readers.close();
   }
 }
@@ -94,9 +96,10 @@ function textInPage(name) {
   return text;
 }
 
-// Fetch a file beside the page, as bytes; `onBytes` is called with the number of bytes each time some arrive.
-async function fetched(name, entry, onBytes = () => {}) {
-  const response = await fetch(name);
+// Fetch a file beside the page, as bytes; `onBytes` is called with the number of bytes each time some arrive. The browser
+// asks the server whether a copy that it has kept is still the file: the scene may have been exported again.
+async function fetched(name, entry, onBytes = () => {}, signal) {
+  const response = await fetch(name, { cache: "no-cache", signal });
   if (!response.ok) throw new Error(`${name}: expected it beside the page, got ${response.status}`);
   const most = entry?.bytes ?? 1 << 24;
   const data = new Uint8Array(most);

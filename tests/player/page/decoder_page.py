@@ -64,15 +64,15 @@ export const arrangeFeatures = (manifest, features) => ({
 the decoder's own array of the features, which a worker then loses to the page."""
 
 
-def decoder_page(files: Mapping[str, bytes], before: str = "", policy: str = "") -> bytes:
+def decoder_page(files: Mapping[str, bytes], before: str = "", policy: str = "", main: str = MAIN) -> bytes:
     """Return a page that decodes the data `files` in it; `before` runs first, in the page and its worker."""
-    modules = {**web_files(), "main.js": MAIN, "grid.js": ARRANGED}
+    modules = {**web_files(), "main.js": main, "grid.js": ARRANGED}
     text = before + page_script(modules)
     script = f'<script type="module" id="script">{text}</script>\n'
     return f"<!doctype html>{policy}{script}".encode() + data_elements(files)
 
 
-def decoded(browser: Browser, path: Path) -> dict[str, Any]:
+def decoded(browser: Browser, path: Path) -> Any:
     """Open the page at `path` and return what it found; check that it requests nothing and logs nothing."""
     context = browser.new_context(offline=True)
     page = context.new_page()

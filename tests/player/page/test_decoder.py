@@ -144,6 +144,34 @@ def test_it_decodes_where_workers_or_checksums_are_not_to_be_had(
         assert found["error"] is None and without_problem(found["scenes"][-1]) == expected(levels)
 
 
+BREAKS = """
+import { loadScene } from "./loader.js";
+
+const pause = setTimeout;
+let nPauses = 0; // the decoder pauses after each channel
+globalThis.setTimeout = (go) => (nPauses++, pause(go));
+globalThis.found = (async () => {
+  const told = [];
+  for await (const _ of loadScene((progress) => told.push(progress))) break;
+  const before = told.length;
+  while (nPauses < N_CHANNELS) await new Promise((go) => { pause(go); });
+  return [before, told.length];
+})();
+"""
+
+
+def test_no_progress_is_told_once_nobody_wants_the_scene(
+    chromium: Browser, levels: Asset, tmp_path: Path
+) -> None:
+    """Where there are no workers, the page goes on decoding the part that it has begun."""
+    sections = levels.manifest.parts[0].sections
+    n_channels = sum(section.n_channels for section in sections if section.kind == "symbols")
+    path, main = tmp_path / "page.html", BREAKS.replace("N_CHANNELS", str(n_channels))
+    path.write_bytes(decoder_page(scene_files(levels), "globalThis.Worker = undefined;\n", main=main))
+    before, behind = decoded(chromium, path)
+    assert before == behind
+
+
 def test_the_head_is_what_the_player_reads(chromium: Browser, tmp_path: Path, levels: Asset) -> None:
     arrays = asset_head(levels)
     head = check(chromium, tmp_path, levels)["head"]

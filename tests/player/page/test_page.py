@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import base64
 import hashlib
+import os
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from threading import Thread
 from typing import NamedTuple
 
 import numpy as np
@@ -42,10 +46,11 @@ class Opened(NamedTuple):
 
 @contextmanager
 def opened(
-    browser: Browser, address: str, answers: dict[str, tuple[bytes, str]] | None = None
+    browser: Browser, address: str, answers: dict[str, tuple[bytes, str]] | None = None, offline: bool = True
 ) -> Iterator[Opened]:
     """Open a page without a network, except for `answers`: content and its type by address."""
-    context = browser.new_context(offline=answers is None, viewport={"width": 160, "height": 120})
+    offline = offline and answers is None
+    context = browser.new_context(offline=offline, viewport={"width": 160, "height": 120})
     found = Opened(context.new_page(), [], [])
     found.page.set_default_timeout(SECONDS * 1000)
     found.page.on("console", lambda message: found.said.append(message.text))
@@ -59,7 +64,7 @@ def opened(
 
 
 def answer(route: Route, answers: dict[str, tuple[bytes, str]]) -> None:
-    known = answers.get(route.request.url)
+    known = answers.get(route.request.url.partition("?")[0])
     if known is None:
         route.abort()
     else:
@@ -292,8 +297,52 @@ def test_a_site_plays_from_a_server(chromium: Browser, asset: Asset) -> None:
     answers = site(asset)
     with opened(chromium, SITE, answers) as found:
         check_plays(found)
-        assert set(found.asked) <= set(answers)
-        assert {SITE + name for name in ("poster.jpg", "worker.js", "part_0.bin")} <= set(found.asked)
+        asked = {url.partition("?")[0] for url in found.asked}
+        assert asked <= set(answers)
+        assert {SITE + name for name in ("poster.jpg", "worker.js", "part_0.bin")} <= asked
+
+
+class Server(SimpleHTTPRequestHandler):
+    """A server that, as many do, says when a file was written but not how long a browser may keep it."""
+
+    def log_message(self, format: str, *args: object) -> None:
+        pass
+
+
+@contextmanager
+def served(folder: Path) -> Iterator[str]:
+    """Serve a folder; yield its address."""
+    with ThreadingHTTPServer(("127.0.0.1", 0), partial(Server, directory=str(folder))) as server:
+        Thread(target=server.serve_forever).start()
+        try:
+            yield f"http://127.0.0.1:{server.server_port}/"
+        finally:
+            server.shutdown()
+
+
+def test_a_site_that_is_exported_again_shows_the_new_scene(
+    chromium: Browser, asset: Asset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Browsers keep each file for a tenth of its age, if the server does not say for how long."""
+    folder = tmp_path / "site"
+    folder.mkdir()
+
+    def export(some: Asset, time: int) -> None:
+        for name, data in page_of_many_files(some).files.items():
+            (folder / name).write_bytes(data)
+            os.utime(folder / name, (time, time))
+
+    export(asset, 1_000_000_000)
+    with served(folder) as address, opened(chromium, address, offline=False) as found:
+        n_channels = "() => vfr.ready.then(() => vfr.info.n_channels)"
+        assert found.page.evaluate(n_channels) == 4
+        files = web_files()
+        files["main.js"] = 'document.title = "new";\n' + files["main.js"]
+        monkeypatch.setitem(page_of_many_files.__globals__, "web_files", lambda: files)
+        export(scenes.empty(tmp_path / "asset", 5), 1_000_000_001)
+        found.page.reload()
+        assert found.page.evaluate(n_channels) == 5
+        assert found.page.title() == "new"
 
 
 @pytest.mark.parametrize("kind", ["one file", "a folder on a disk", "a folder of plain text"])
@@ -320,6 +369,17 @@ def test_a_page_whose_script_does_not_run_says_what_to_do(
     assert ("python -m http.server" in said) == (kind != "one file") == ("scene as one file" in said)
 
 
+@pytest.mark.parametrize(
+    "before", [b"(", b'import { none } from "./pose.js";', b"throw 1;"], ids=["parse", "link", "run"]
+)
+def test_a_site_whose_script_fails_says_what_to_do(chromium: Browser, asset: Asset, before: bytes) -> None:
+    answers = site(asset)
+    body, type_ = answers[SITE + "loader.js"]
+    answers[SITE + "loader.js"] = (before + body, type_)
+    with opened(chromium, SITE, answers) as found:
+        wait_for(found.page, lambda: "script cannot run here. Open " in found.page.inner_text("#status"))
+
+
 @pytest.mark.parametrize("kind", ["one file", "a folder"])
 def test_a_page_that_is_still_arriving_only_says_that_it_loads(
     chromium: Browser, asset: Asset, kind: str
@@ -332,6 +392,15 @@ def test_a_page_that_is_still_arriving_only_says_that_it_loads(
     with opened(chromium, SITE, {**answers, SITE: (arriving, "text/html")}) as found:
         found.page.evaluate("() => document.getAnimations().forEach((each) => each.finish())")
         assert found.page.inner_text("#status").strip() == "Loading…"
+
+
+def test_a_scene_that_cannot_be_shown_is_not_loaded_further(chromium: Browser, asset: Asset) -> None:
+    with opened(chromium, "about:blank", site(asset)) as found:
+        found.page.add_init_script("HTMLCanvasElement.prototype.getContext = () => null;")
+        found.page.route(SITE + "part_0.bin", lambda route: None)  # it never arrives
+        with found.page.expect_event("requestfailed", lambda request: request.url == SITE + "part_0.bin"):
+            found.page.goto(SITE)
+        found.page.wait_for_selector("body.failed")
 
 
 def check_advises_another_device(found: Opened) -> str:
