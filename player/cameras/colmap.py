@@ -18,7 +18,7 @@ import numpy as np
 from player.cameras.camera import Camera
 from player.cameras.rotations import OPENGL_FROM_OPENCV, rotation_matrix
 from player.errors import DataError, FormatError
-from player.files.files import read_bytes
+from player.files.files import open_file, read_bytes
 
 MODELS = {
     0: ("SIMPLE_PINHOLE", ("f", "cx", "cy")),
@@ -59,11 +59,31 @@ class RegisteredImage:
 
 
 def colmap_folder(folder: Path) -> Path | None:
-    """Find the folder of the COLMAP model that belongs to the pictures in `folder`; None if there is none."""
+    """Find the folder of the COLMAP model that belongs to the pictures in `folder`; None if there is none. Of
+    several models, which COLMAP numbers in any order, it is the one with the most pictures."""
     for name in FOLDERS:
         if (folder / name / "images.bin").exists():
-            return folder / name
+            return max(numbered_models(folder / name), key=lambda model: _n_images(model / "images.bin"))
     return None
+
+
+def numbered_models(model: Path) -> list[Path]:
+    """Return the folders of a COLMAP model and of those that COLMAP has numbered beside it, in their order.
+
+    >>> [model.name for model in numbered_models(Path("surely/not/there/0"))]
+    ['0']
+    """
+    if not model.name.isdecimal():
+        return [model]
+    found = [path.parent for path in model.parent.glob("*/images.bin") if path.parent.name.isdecimal()]
+    return sorted({model, *found}, key=lambda each: int(each.name))
+
+
+def _n_images(path: Path) -> int:
+    """Return the number of pictures that `images.bin` begins with; 0 if it is cut short. Raises
+    FormatError."""
+    with open_file(path, "a COLMAP model", MAX_FILE_BYTES) as file:
+        return int.from_bytes(file.read(8), "little")
 
 
 def read_views(model: Path) -> list[Camera]:

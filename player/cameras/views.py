@@ -71,7 +71,7 @@ def _colmap_model(path: Path) -> Path | None:
         return path.parent
     if not path.is_dir():
         return None
-    for folder in (path, *(path / name for name in colmap.FOLDERS)):
+    for folder in (path, colmap.colmap_folder(path) or path, *(path / name for name in colmap.FOLDERS)):
         if (folder / "images.bin").exists() or (folder / "images.txt").exists():
             return folder
     raise FormatError(f"{path}: expected {EXPECTED}, got a folder without images.bin or images.txt")

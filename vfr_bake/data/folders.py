@@ -12,7 +12,14 @@ from typing import Any
 import numpy as np
 
 from player.cameras.camera import Camera
-from player.cameras.colmap import RegisteredImage, colmap_folder, read_cameras, read_images, read_points
+from player.cameras.colmap import (
+    RegisteredImage,
+    colmap_folder,
+    numbered_models,
+    read_cameras,
+    read_images,
+    read_points,
+)
 from player.cameras.transforms import load_transforms, transforms_cameras, transforms_number
 from player.errors import DataError, FormatError
 from player.files.json_files import as_float, brief
@@ -325,8 +332,11 @@ def load_colmap_folder(
     Pictures are looked for in `images/` and in the folder itself; every eighth is held out. The pixels are
     taken as stored, unless this project estimated the model from upright pictures, or the cameras belong to
     upright pictures (`is_taken_upright`). Pictures that were removed after this project estimated the model
-    are left out, and the reader says so; it also says which were replaced. Raises DataError (pictures, camera
-    models) or FormatError (the model's files), in one line that names the file.
+    are left out, and the reader says so; it also says which were replaced, and how many pictures have no
+    camera in a model of another program. Of several models the one with the most pictures is taken.
+
+    Raises DataError (pictures, camera models) or FormatError (the model's files), in one line that names the
+    file.
     """
     model = colmap_folder(folder)
     assert model is not None
@@ -337,8 +347,12 @@ def load_colmap_folder(
     points_file = model / "points3D.bin"
     points = read_points(points_file) if points_file.exists() else None
     record, reader = read_record(model), reader or PictureReader()
+    if (n_models := len(numbered_models(model))) > 1:
+        reader.say(f"of {n_models} COLMAP models {model} is used, which has the most pictures")
     if record.upright:
         registered = _still_there(folder, registered, reader.say)
+    else:
+        _tell_of_others(folder, registered, reader.say)
     described, replaced = [], []
     for image in registered:
         if image.camera_id not in lenses:
@@ -364,6 +378,14 @@ def load_colmap_folder(
         reader.say(strays)
     train, test = held_out(reader.read(described, progress))
     return _capture(folder, described, train, test, points)
+
+
+def _tell_of_others(folder: Path, registered: list[RegisteredImage], say: Callable[[str], object]) -> None:
+    """Say how many pictures have cameras if another program has estimated these, and not of all."""
+    place, pictures = find_pictures(folder)
+    names = {path.relative_to(place).as_posix() for path in pictures} | {image.name for image in registered}
+    if len(names) > len(registered):
+        say(f"{len(registered)} of {len(names)} pictures have cameras; the others are not used")
 
 
 def _still_there(

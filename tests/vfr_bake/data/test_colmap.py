@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from player.cameras.camera import Camera
 from player.cameras.colmap import read_cameras, read_images, read_points
 from player.cameras.rotations import OPENGL_FROM_OPENCV
+from player.cameras.views import read_views
 from player.errors import DataError, FormatError
 from vfr_bake.data import load_scene
 from vfr_bake.data.demo import demo_cameras
@@ -144,6 +145,22 @@ def test_what_cannot_be_served_is_said(folder: Path, tmp_path: Path) -> None:
     alone = write_model(tmp_path / "alone", demo_cameras(SIZE, 1))
     with pytest.raises(DataError, match="registered pictures: expected at least 2, got 1"):
         load_folder(alone)
+
+
+def test_the_largest_of_several_models_is_taken(folder: Path, tmp_path: Path) -> None:
+    """COLMAP numbers the models of groups that do not fit together in the order in which it began them."""
+    (folder / "sparse" / "0").rename(folder / "sparse" / "10")
+    small = write_model(tmp_path / "small", demo_cameras(SIZE, 3))
+    (small / "sparse" / "0").rename(folder / "sparse" / "0")
+    for name in ("010.png", "011.png"):
+        Image.new("RGB", (SIZE, SIZE)).save(folder / "images" / name)
+    said: list[str] = []
+    capture = load_folder(folder, None, PictureReader(say=said.append))
+    assert len(capture.train.cameras) + len(capture.test.cameras) == len(read_views(folder)) == 10
+    assert said[:2] == [
+        f"of 2 COLMAP models {folder / 'sparse' / '10'} is used, which has the most pictures",
+        "10 of 12 pictures have cameras; the others are not used",
+    ]
 
 
 def test_other_pictures_under_the_old_names_are_told_of(folder: Path) -> None:
