@@ -1,8 +1,9 @@
 """Writer of a COLMAP model, for Gaussian splatting and multi-view stereo.
 
-The files are text (`cameras.txt`, `images.txt`, `points3D.txt`). If the name of a picture has white space,
-they are binary (`cameras.bin`, `images.bin`, `points3D.bin`) with the same content: readers of the text end a
-name at its first space, while in binary form a name ends with a zero byte.
+The files are text (`cameras.txt`, `images.txt`, `points3D.txt`). If the name of a picture has white space, or
+there are more than MAX_TEXT_POINTS points, they are binary (`cameras.bin`, `images.bin`, `points3D.bin`) with
+the same content: readers of the text end a name at its first space, while in binary form a name ends with a
+zero byte, and text of many points takes much memory and time.
 
 A COLMAP camera looks along +z with y down (OpenCV). A picture's pose is the transform camera from world, as a
 quaternion (w, x, y, z) and a translation. Pixel centres are at +0.5, as in this project. Pictures have no
@@ -37,6 +38,8 @@ _HEADS = (
     "# POINT3D_ID, X, Y, Z, R, G, B, ERROR, then its track (none)",
 )
 """The first lines of the text files."""
+MAX_TEXT_POINTS = 1_000_000
+"""Most points of a text model. While text is made, a point takes 430 bytes of memory, in binary form 103."""
 TOLERANCE = 1e-9
 """Largest relative difference of a camera read back: poses go through a quaternion and back, in float64."""
 
@@ -93,7 +96,8 @@ def colmap_files(cameras: Sequence[Camera], cloud: TriangleMesh) -> dict[str, by
     ['cameras.bin', 'images.bin', 'points3D.bin']
     """
     model = _model(cameras, cloud)
-    if any(character.isspace() for image in model.images for character in image.name):
+    has_space = any(character.isspace() for image in model.images for character in image.name)
+    if has_space or len(model.places) > MAX_TEXT_POINTS:
         files = _binary_files(model)
         _check(_parse_binary(files), cameras, cloud, BINARY_FILES)
     else:
@@ -191,8 +195,10 @@ def _numbers(values: Sequence[float]) -> str:
 
 
 def _parse_text(files: dict[str, bytes]) -> _Model:
-    heads, pictures, points = (
-        [line for line in files[name].decode().split("\n")[1:-1] if line] for name in TEXT_FILES
+    cameras_file, images_file, points_file = TEXT_FILES
+    heads, pictures = (
+        [line for line in files[name].decode().split("\n")[1:-1] if line]
+        for name in (cameras_file, images_file)
     )
     lenses: dict[int, tuple[float, ...]] = {}
     for line in heads:
@@ -202,7 +208,7 @@ def _parse_text(files: dict[str, bytes]) -> _Model:
     for line in pictures:
         words = line.split(" ", 9)
         images.append(_Image([float(word) for word in words[1:8]], int(words[8]), words[9]))
-    rows = np.array([line.split() for line in points], np.float64).reshape(-1, 8)
+    rows = np.fromstring(files[points_file].decode().split("\n", 1)[1], sep=" ").reshape(-1, 8)
     return _Model(lenses, images, rows[:, 1:4], rows[:, 4:7])
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 import warnings
 from dataclasses import replace
 from pathlib import Path
@@ -142,6 +143,27 @@ def test_names_with_white_space_make_binary_files(name: str, tmp_path: Path) -> 
     assert [len(data) for data in files.values()] == [
         8 + 2 * 56, 8 + 3 * 73 + 2 * len(name.encode()) + len("a.png"), 8 + 8 * 51
     ]  # fmt: skip
+
+
+def test_many_points_make_binary_files(monkeypatch: pytest.MonkeyPatch) -> None:
+    camera, corners = Camera("a.png", np.eye(4), 4, 3, 5.0, 5.5, 2.0, 1.5), box((0, 0, 0), (1, 1, 1))
+    monkeypatch.setattr(colmap, "MAX_TEXT_POINTS", 8)
+    assert tuple(colmap_files([camera], corners)) == TEXT_FILES
+    monkeypatch.setattr(colmap, "MAX_TEXT_POINTS", 7)
+    assert tuple(colmap_files([camera], corners)) == BINARY_FILES
+
+
+def test_text_of_points_is_read_back_in_little_memory() -> None:
+    """Reading takes the text twice and the numbers, 64 bytes a point; words or lines of their own would take
+    several hundred."""
+    points = sample_points(box((0, 0, 0), (1, 1, 1)), 20_000)
+    files = colmap_files([Camera("a.png", np.eye(4), 4, 3, 5.0, 5.5, 2.0, 1.5)], points)
+    tracemalloc.start()
+    model = colmap._parse_text(files)
+    _, most = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert np.array_equal(model.places, points.vertices)
+    assert most < 2 * len(files["points3D.txt"]) + 100 * 20_000
 
 
 def test_parity() -> None:
