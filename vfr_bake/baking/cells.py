@@ -17,6 +17,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
+from player.cameras.camera import Camera
 from player.errors import TrainingError
 from player.march.contracted import MAX_SPEED
 from player.progress import Progress
@@ -38,9 +39,9 @@ MOST_SEEING = 2_000_000
 """Most rays that search for the cells of an unbounded scene. It bounds the time, however many views there are
 and wherever they stand. Fox needs 1.2 million rays for CONTRACTED_HITS hits."""
 LEAST_DISTANCE = 0.5
-"""Distance, model units, at which a camera of an unbounded scene counts at least. A camera at the origin, as
-in a walk through a room, would seem to meet every block by itself, although it stands a unit away from those
-at the unit sphere."""
+"""Distance, model units, at which a camera counts at least. A camera at the origin, as in a walk through a
+room, would seem to meet every cell by itself, although it stands a unit away from those at the unit
+sphere."""
 VIEWS_OF_A_CELL = 0.4
 """Rough share of the training views that see a given piece of surface."""
 BLOCK = 2
@@ -228,16 +229,17 @@ def marked_cells(
     """Return [resolution, resolution, resolution, n_floors] uint8: 1 for each cell and floor for which a
     sample in the cell, on a ray of some view, weighs at least the floor.
 
-    Views are the training cameras and as many between them. Whatever the size of the pictures, rays are as
-    dense as it takes for every surface cell to be met about HITS times over all views.
+    Views are the training cameras and as many between them. Whatever the sizes of the pictures and the
+    distances of the cameras, rays are as dense as it takes for every surface cell to be met about HITS times
+    over all views, by each view as often.
     """
     marks = np.zeros((*(resolution,) * 3, len(weight_floors)), np.uint8)
     cameras = model.model_cameras()
     cameras += views_between(model, len(cameras), seed=0)
-    density = _ray_density(np.tile(pixel_footprints(model), 2), 2 / resolution)
     # A step no longer than a cell: samples must not skip cells, because other rays than these will be played.
     step = min(model.occupancy.step, 2 / resolution)
     for index, camera in enumerate(cameras):
+        density = _ray_density(camera, len(cameras), resolution)
         size = (max(1, round(camera.width * density)), max(1, round(camera.height * density)))
         rays_o, rays_d = camera.resized(*size).rays()
         mark_visible_cells(
@@ -254,23 +256,28 @@ def occupied_cells(model: Model, resolution: int) -> np.ndarray:
     return _overlapping(model.occupancy.occupied, resolution)
 
 
-def pixel_footprints(model: Model, least_distance: float = 1e-6) -> np.ndarray:
+def pixel_footprints(model: Model) -> np.ndarray:
     """Return [n_views]: the size of each training camera's pixels at the origin of the model frame, model
-    units. Cameras count as at least `least_distance` away from it."""
-    cameras = model.model_cameras()
-    return np.array([max(float(np.linalg.norm(c.c2w[:3, 3])), least_distance) / c.fx for c in cameras])
+    units (`_footprint`)."""
+    return np.array([_footprint(camera) for camera in model.model_cameras()])
+
+
+def _footprint(camera: Camera) -> float:
+    """Return the size of a camera's pixels at the origin, which counts as at least LEAST_DISTANCE away."""
+    return max(float(np.linalg.norm(camera.c2w[:3, 3])), LEAST_DISTANCE) / camera.fx
 
 
 def rays_of_views(model: Model, resolution: int) -> float:
     """Return the expected number of rays that `marked_cells` marches."""
-    density = _ray_density(np.tile(pixel_footprints(model), 2), 2 / resolution)
-    return 2 * density**2 * sum(camera.width * camera.height for camera in model.cameras)
+    cameras = model.model_cameras()
+    densities = [_ray_density(camera, 2 * len(cameras), resolution) for camera in cameras]
+    return 2 * sum(d**2 * c.width * c.height for d, c in zip(densities, cameras, strict=True))
 
 
-def _ray_density(footprints: np.ndarray, cell: float) -> float:
-    """Return the rays per pixel, along each image axis, with which HITS rays meet each surface cell at the
-    middle of the box; 0.25 to 4."""
-    hits = VIEWS_OF_A_CELL * float(np.sum((cell / footprints) ** 2))
+def _ray_density(camera: Camera, n_views: int, resolution: int) -> float:
+    """Return the camera's rays per pixel, along each image axis, with which rays of `n_views` such views meet
+    each surface cell at the middle of the box HITS times; 0.25 to 4."""
+    hits = VIEWS_OF_A_CELL * n_views * (2 / resolution / _footprint(camera)) ** 2
     return float(np.clip(np.sqrt(HITS / hits), 0.25, 4.0))
 
 
@@ -391,7 +398,7 @@ def _pixels_of_contracted_views(model: Model) -> float:
 
 
 def _share_of_pixels(model: Model, resolution: int) -> float:
-    footprints = np.tile(pixel_footprints(model, LEAST_DISTANCE), 1 + BETWEEN)
+    footprints = np.tile(pixel_footprints(model), 1 + BETWEEN)
     hits = VIEWS_OF_A_CELL * float(np.sum((4 * BLOCK / resolution / footprints) ** 2))
     return min(CONTRACTED_HITS / hits, MOST_SEEING / _pixels_of_contracted_views(model), 1.0)
 

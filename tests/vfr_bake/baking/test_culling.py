@@ -21,6 +21,7 @@ from vfr_bake.baking.cells import (
     cull,
     marked_cells,
     occupied_cells,
+    rays_of_views,
 )
 from vfr_bake.baking.held_out import HeldOut, expected_loss
 from vfr_bake.config import BakeConfig
@@ -80,6 +81,18 @@ def test_a_low_floor_marks_more(model: Model) -> None:
     assert 0 < together[..., 0].sum() < together[..., 1].sum() < together[..., 2].sum()
     alone = marked_cells(model, 64, floors[1:2], silent)
     assert np.array_equal(together[..., 1], alone[..., 0])
+
+
+def test_a_camera_in_the_middle_of_the_box_takes_no_rays_from_the_others(model: Model) -> None:
+    """A camera in the middle seems to meet every cell by itself, but sees few of them."""
+    model = replace(model, witnesses=None)
+    c2w = model.model_cameras()[0].c2w.copy()
+    c2w[:3, 3] = 0.01
+    middle = replace(model.model_cameras()[0], c2w=c2w).transformed(model.world_from_model)
+    more = replace(model, cameras=[*model.cameras, middle])
+    assert rays_of_views(more, 64) > 0.9 * rays_of_views(model, 64)
+    n, n_more = (int(marked_cells(each, 64, (0.01,), silent).sum()) for each in (model, more))
+    assert n_more > 0.98 * n
 
 
 def volume(folder: Path) -> float:
