@@ -15,6 +15,7 @@ marched all the same, a picture with fewer lookups, all of whose pixels are marc
 
 from __future__ import annotations
 
+import math
 from bisect import bisect_left
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -45,7 +46,9 @@ WORST = 3.0
 SHARES = tuple(0.85**n for n in range(16))
 """Shares of the usual levels that are tried, in this order; if all lose too much, every pixel is marched."""
 MOST_PIXELS = 1_500_000
-"""Most pixels of all compared pictures together; the first picture is compared whatever its size."""
+"""Most pixels of all compared pictures together; the first picture is compared even if it has more."""
+MOST_OF_PICTURE = 1600 * 1200
+"""Most pixels that a compared picture is rendered at; of a larger one its middle is compared."""
 MARCH = 70_000
 """Cost of marching a ray, in weights of a head: evaluating a head of this many weights takes as long."""
 APART, FEWER = 2.0, 0.8
@@ -65,24 +68,45 @@ class ComparedView:
     photograph: np.ndarray | None
     """[n, 3] colours of these pixels in the photograph, 0 to 1; None if there is no photograph."""
 
+    def middle(self) -> ComparedView:
+        """Return the middle of the view, MOST_OF_PICTURE pixels, or the view itself if it has no more."""
+        camera = self.camera
+        share = math.sqrt(MOST_OF_PICTURE / (camera.width * camera.height))
+        if share >= 1:
+            return self
+        width, height = max(int(share * camera.width), 1), max(int(share * camera.height), 1)
+        x, y = (camera.width - width) // 2, (camera.height - height) // 2
+        rows, columns = self.pixels // camera.width - y, self.pixels % camera.width - x
+        seen = (rows >= 0) & (rows < height) & (columns >= 0) & (columns < width)
+        part = replace(camera, width=width, height=height, cx=camera.cx - x, cy=camera.cy - y)
+        photograph = None if self.photograph is None else self.photograph[seen]
+        return ComparedView(part, (rows * width + columns)[seen], photograph)
+
 
 def compared_views(model: Model, n_views: int) -> list[ComparedView]:
     """Return the views whose whole pictures are witnesses, as many as MOST_PIXELS allows. If there are none
     that show anything, return `n_views` views between the training cameras."""
+    if found := _photographed_views(model):
+        return found
+    between = (view.transformed(model.world_from_model) for view in views_between(model, n_views, SEED))
+    small = [camera.at_most(LONGEST_SIDE) for camera in between]
+    return [ComparedView(camera, np.arange(camera.width * camera.height), None) for camera in small]
+
+
+def _photographed_views(model: Model) -> list[ComparedView]:
     witnesses = model.neutral_witnesses()
-    numbers = np.zeros(0, np.int64) if witnesses is None else witnesses.views()
-    if witnesses is None or not np.isin(witnesses.whole, numbers).any():
-        between = (view.transformed(model.world_from_model) for view in views_between(model, n_views, SEED))
-        small = [camera.at_most(LONGEST_SIDE) for camera in between]
-        return [ComparedView(camera, np.arange(camera.width * camera.height), None) for camera in small]
-    found, n_pixels = [], 0
+    if witnesses is None:
+        return []
+    found, n_pixels, numbers = [], 0, witnesses.views()
     for number in witnesses.whole[np.isin(witnesses.whole, numbers)]:
-        camera, rows = model.cameras[number], numbers == number
-        n_pixels += camera.width * camera.height
+        rows = numbers == number
+        photograph = to_8_bit(over_background(witnesses.rgba[rows], model.background)) / 255
+        view = ComparedView(model.cameras[number], witnesses.pixels[rows], photograph).middle()
+        n_pixels += view.camera.width * view.camera.height
         if found and n_pixels > MOST_PIXELS:
             break
-        photograph = to_8_bit(over_background(witnesses.rgba[rows], model.background)) / 255
-        found.append(ComparedView(camera, witnesses.pixels[rows], photograph))
+        if len(view.pixels):
+            found.append(view)
     return found
 
 

@@ -154,6 +154,27 @@ def test_whole_photographs_are_compared_where_there_are_some(model: Model) -> No
     assert {(view.camera.width, view.camera.height) for view in compared_views(wide, 2)} == {(640, 480)}
 
 
+def test_the_middle_of_a_large_photograph_is_compared(
+    model: Model, asset: Asset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It shows what the whole picture shows there, but for the rounding of rays."""
+    (whole,) = compared_views(model, 1)
+    monkeypatch.setattr(qualities, "MOST_OF_PICTURE", 1000)
+    (part,) = compared_views(model, 1)
+    assert 900 < part.camera.width * part.camera.height <= 1000
+    assert 0 < len(part.pixels) == len(part.photograph) < len(whole.pixels)
+    with Renderer(asset) as renderer:
+        shown, seen = (renderer.render(view.camera).rgb.reshape(-1, 3) for view in (whole, part))
+    first = (64 - part.camera.width) // 2
+    number = np.arange(64 * 64).reshape(64, 64)[first : first + part.camera.height, first:][
+        :, : part.camera.width
+    ]
+    np.testing.assert_allclose(seen, shown[number.reshape(-1)], rtol=0, atol=0.05)
+    rows = np.isin(whole.pixels, number)
+    assert np.array_equal(number.reshape(-1)[part.pixels], whole.pixels[rows])
+    assert np.array_equal(part.photograph, whole.photograph[rows])
+
+
 def test_the_asset_has_what_was_found(model: Model, asset: Asset) -> None:
     found = fitting_qualities(asset, compared_views(model, 1), 1.0)
     assert (asset.manifest.agreement, asset.manifest.quality_fetches) == found
