@@ -10,11 +10,14 @@ A cell is named by its lowest vertex. Here it is live when all eight of its corn
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 BRICK = 8
 """Vertices, or in a pyramid cells, along each edge of a brick."""
 
+Find = Callable[[np.ndarray], np.ndarray]
 _ALL = np.uint64(0xFFFFFFFFFFFFFFFF)
 _Y_FIRST = np.uint64(0xFF)  # the bits of a word with y = 0
 _Z_LAST = np.uint64(0x8080808080808080)  # the bits of a word with z = 7
@@ -114,7 +117,7 @@ def neighbours(brick_coords: np.ndarray, index: np.ndarray, offset: tuple[int, .
     return padded[tuple((np.asarray(brick_coords, np.int64) + offset).T)]
 
 
-def with_apron(values: np.ndarray, brick_coords: np.ndarray, index: np.ndarray, out: np.ndarray) -> None:
+def with_apron(values: np.ndarray, brick_coords: np.ndarray, find: Find, out: np.ndarray) -> None:
     """Write the values of bricks with an apron to `out` [n, 9, 9, 9].
 
     The apron holds the first vertices of the next bricks behind a brick's own last ones, so that the eight
@@ -123,15 +126,15 @@ def with_apron(values: np.ndarray, brick_coords: np.ndarray, index: np.ndarray, 
     Args:
         values: [n_bricks + 1, 512], indexed by b; the last row stands for every missing brick.
         brick_coords: [n, 3] coordinates of the wanted bricks.
-        index: the index of each brick in `values`, from `dense_index`.
+        find: called with coordinates [n, 3]; returns the index [n] of each brick in `values`, -1 where there
+            is none.
         out: written here; has the dtype of `values`.
     """
-    blocks = values.reshape(-1, BRICK, BRICK, BRICK)
+    blocks, coords = values.reshape(-1, BRICK, BRICK, BRICK), np.asarray(brick_coords, np.int64)
     for offset in np.ndindex(2, 2, 2):
-        source = neighbours(brick_coords, index, offset)
         into = tuple(slice(BRICK, None) if o else slice(BRICK) for o in offset)
         take = tuple(slice(1) if o else slice(None) for o in offset)
-        out[(slice(None), *into)] = blocks[(slice(None), *take)][source]
+        out[(slice(None), *into)] = blocks[(slice(None), *take)][find(coords + offset)]
 
 
 def with_corners(brick_coords: np.ndarray, brick_masks: np.ndarray, n_per_axis: int) -> np.ndarray:

@@ -29,7 +29,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from player.asset.bricks import BRICK, bricks_per_axis, dense_index, stored_bits, with_apron, with_corners
+from player.asset.bricks import BRICK, bricks_per_axis, stored_bits, with_apron, with_corners
 from player.asset.density import decode_constants
 from player.asset.pyramid import Bricks, Pyramid, PyramidValues
 
@@ -316,8 +316,7 @@ def vertex_rows(pyramid: Pyramid) -> VertexRows:
             first_row, first_row + vertices.n, dtype=np.int32
         )
         first_row += vertices.n
-        index = dense_index(vertices.bricks.coords, bricks_per_axis(pyramid.cells_per_axis(level)))
-        with_apron(rows, wanted, index, apron[n_held - len(wanted) : n_held])
+        with_apron(rows, wanted, vertices.bricks.find, apron[n_held - len(wanted) : n_held])
         n_held -= len(wanted)
     return VertexRows(pyramid.resolution, len(owners), owners.reshape(-1), apron.reshape(-1))
 
@@ -357,8 +356,7 @@ def _with_apron(densities: PyramidValues, coords: Sequence[np.ndarray]) -> np.nd
         stored = stored_bits(vertices.masks)
         dense = np.zeros((len(stored) + 1, stored.shape[1]), np.uint8)
         dense[:-1].reshape(-1)[stored.reshape(-1)] = values[:, 0]
-        index = dense_index(vertices.coords, bricks_per_axis(pyramid.cells_per_axis(level)))
-        with_apron(dense, some, index, apron[first : first + len(some)])
+        with_apron(dense, some, vertices.find, apron[first : first + len(some)])
         first += len(some)
     return flat
 

@@ -23,7 +23,7 @@ from functools import cached_property
 
 import numpy as np
 
-from player.asset.bricks import BRICK, bricks_per_axis, coords_of, keys_of, stored_bits
+from player.asset.bricks import BRICK, bricks_per_axis, coords_of, keys_of, stored_bits, with_apron
 from player.asset.prediction.prediction import Places, values_from
 
 MAX_LEVELS = 8
@@ -337,14 +337,9 @@ def whole_pyramid(resolution: int, leaves: Sequence[Bricks]) -> Pyramid:
 
 def places_between(fine: Vertices, coarse: Vertices) -> Places:
     """Locate the vertices `coarse` of the next coarser level around the bricks of the vertices `fine`."""
-    rows = np.append(coarse.row_of_bit, np.full(BRICK**3, -1, np.int32)).reshape(-1, BRICK, BRICK, BRICK)
+    rows = np.append(coarse.row_of_bit, np.full(BRICK**3, -1, np.int32))
     apron = np.empty((len(coarse.bricks), BRICK + 1, BRICK + 1, BRICK + 1), np.int32)
-    for offset in np.ndindex(2, 2, 2):
-        # -1, for a brick that is missing, is the index of the last one, which is filled with -1
-        beside = coarse.bricks.find(coarse.bricks.coords.astype(np.int64) + offset)
-        into = tuple(slice(BRICK, None) if o else slice(BRICK) for o in offset)
-        take = tuple(slice(1) if o else slice(None) for o in offset)
-        apron[(slice(None), *into)] = rows[(slice(None), *take)][beside]
+    with_apron(rows, coarse.bricks.coords, coarse.bricks.find, apron)
     bricks = np.empty((len(fine.bricks), 4), np.int32)
     bricks[:, 0] = coarse.bricks.find(fine.bricks.coords >> 1)
     bricks[:, 1:] = (fine.bricks.coords & 1) * (BRICK // 2)
