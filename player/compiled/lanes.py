@@ -276,9 +276,8 @@ def gather(base: Any, index: Lanes, size: int, where: Lanes, kind: Any = INT, of
 def scatter(base: Any, index: Lanes, values: Lanes, where: Lanes) -> None:
     """Store numbers of four bytes, of the lanes that are true in `where`, at the indices `index` from the
     address `base` on."""
-    b, nothing = where.b, ir.Constant(vector(LONG), ir.Undefined)
-    one = b.insert_element(nothing, b.ptrtoint(base, LONG), INT(0))
-    start = b.shuffle_vector(one, nothing, ir.Constant(vector(INT), [0] * LANES))
+    b = where.b
+    start = splat(b, b.ptrtoint(base, LONG)).value
     numbers = b.mul(b.sext(index.value, vector(LONG)), ir.Constant(vector(LONG), [4] * LANES))
     places = b.inttoptr(b.add(numbers, start), ir.VectorType(ir.PointerType(values.element), LANES))
     kind = ir.FunctionType(ir.VoidType(), [values.value.type, places.type, INT, where.value.type])

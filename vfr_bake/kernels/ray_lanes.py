@@ -67,9 +67,7 @@ def gathered(base: Any, index: Lanes, kind: Any) -> Lanes:
     Field samples take 0.7 to 0.8 of the time that they take with loads one by one.
     """
     b, bits = index.b, kind.width
-    nothing = ir.Constant(vector(LONG), ir.Undefined)
-    one = b.insert_element(nothing, b.ptrtoint(base, LONG), INT(0))
-    start = b.shuffle_vector(one, nothing, ir.Constant(vector(INT), [0] * LANES))
+    start = splat(b, b.ptrtoint(base, LONG)).value
     behind = b.mul(index.wide().value, ir.Constant(vector(LONG), [bits // 8] * LANES))
     places = b.inttoptr(b.add(behind, start), ir.VectorType(ir.PointerType(kind), LANES))
     all_of_them = ir.Constant(ir.VectorType(ir.IntType(1), LANES), [1] * LANES)
