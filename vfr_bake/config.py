@@ -365,7 +365,7 @@ class BakeConfig:
     from it. Not given: 4, or half of the machine's memory if that is less."""
     check_views: int = 4
     """Views between the training cameras on which each step of the bake is compared with the model's own
-    pictures; 1 to 1,000."""
+    pictures; 1 to 1,000, of which many have fewer pixels each."""
 
     def __post_init__(self) -> None:
         check(self, "preset", self.preset in PRESETS, f"one of {tuple(PRESETS)}")

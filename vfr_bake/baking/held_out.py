@@ -55,6 +55,9 @@ RAYS_OF_A_VIEW = 20_000
 """Most rays of a view between cameras."""
 RAYS_BESIDE_WITNESSES = 5_000
 """Most rays of a view between cameras if the model has witnesses, whose rays make up for the difference."""
+MOST_BETWEEN = 200_000
+"""Most rays of all views between cameras together, however many views there are: each step of the bake plays
+them."""
 N_LEARNED = 20_000
 """Training pixels on which small changes are measured."""
 RAYS_AT_ONCE = 1 << 13
@@ -166,6 +169,7 @@ class HeldOut:
         if witnesses is not None and not len(witnesses.pixels):
             witnesses = None
         n_of_view = RAYS_OF_A_VIEW if witnesses is None else RAYS_BESIDE_WITNESSES
+        n_of_view = min(n_of_view, MOST_BETWEEN // n_views)
         random = np.random.default_rng(SEED)
         rays = []
         for camera in views_between(model, n_views, SEED):

@@ -85,11 +85,14 @@ class ComparedView:
 
 def compared_views(model: Model, n_views: int) -> list[ComparedView]:
     """Return the views whose whole pictures are witnesses, as many as MOST_PIXELS allows. If there are none
-    that show anything, return `n_views` views between the training cameras."""
+    that show anything, return `n_views` views between the training cameras, or as many as it takes for
+    MOST_PIXELS."""
     if found := _photographed_views(model):
         return found
-    between = (view.transformed(model.world_from_model) for view in views_between(model, n_views, SEED))
-    small = [camera.at_most(LONGEST_SIDE) for camera in between]
+    sizes = [camera.at_most(LONGEST_SIDE) for camera in model.cameras]
+    enough = math.ceil(MOST_PIXELS / max(camera.width * camera.height for camera in sizes))
+    between = views_between(model, min(n_views, enough), SEED)
+    small = [camera.transformed(model.world_from_model).at_most(LONGEST_SIDE) for camera in between]
     return [ComparedView(camera, np.arange(camera.width * camera.height), None) for camera in small]
 
 

@@ -36,6 +36,11 @@ def baked(model: Model, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path,
     return folder, bake(model, folder, SMALL, silent)
 
 
+def test_many_views_share_their_rays(model: Model, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(held_out, "MOST_BETWEEN", 6000)
+    assert [HeldOut(model, n)._n_between for n in (1, 2, 6)] == [64 * 64, 6000, 6000]
+
+
 def test_rays_are_marched_in_parts_as_at_once(model: Model, monkeypatch: pytest.MonkeyPatch) -> None:
     shown, grid = HeldOut(model, 1), random_scene(40, 40, (1, 2), seed=3).grid
     monkeypatch.setattr(held_out, "RAYS_AT_ONCE", len(shown.rays_o))

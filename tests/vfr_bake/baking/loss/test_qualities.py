@@ -150,6 +150,8 @@ def test_whole_photographs_are_compared_where_there_are_some(model: Model) -> No
     assert len(between) == 3 and all(view.photograph is None for view in between)
     masked = replace(model.witnesses, whole=np.array([len(model.witnesses.counts)], np.int32))
     assert all(view.photograph is None for view in compared_views(replace(model, witnesses=masked), 3))
+    enough = -(-qualities.MOST_PIXELS // 64**2)
+    assert len(compared_views(none, 1000)) == enough < 1000, "all of them would take hours"
     wide = replace(none, cameras=[camera.resized(1600, 1200) for camera in model.cameras])
     assert {(view.camera.width, view.camera.height) for view in compared_views(wide, 2)} == {(640, 480)}
 
