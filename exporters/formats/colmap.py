@@ -17,7 +17,7 @@ import struct
 import sys
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import NamedTuple
 
 import numpy as np
@@ -81,6 +81,8 @@ def colmap_files(cameras: Sequence[Camera], cloud: TriangleMesh) -> dict[str, by
     Args:
         cameras: at least one, in the frame of the export; those of equal lens and size share a COLMAP camera.
             A leading `./` of their names is dropped: COLMAP's names are relative to the folder of pictures.
+            Names without a suffix, as NeRF-synthetic has them for PNG files, get `.png`: other programs open
+            the files by these names.
             A matrix that is only nearly a rotation (float32 files) is replaced by the nearest rotation.
         cloud: points in the same frame; its normals and faces are not used.
 
@@ -170,7 +172,8 @@ def _rigid(camera: Camera) -> Camera:
 
 
 def _name(camera: Camera) -> str:
-    return camera.name.replace("\\", "/").removeprefix("./")
+    name = camera.name.replace("\\", "/").removeprefix("./")
+    return name if PurePosixPath(name).suffix else f"{name}.png"
 
 
 def _text_files(model: _Model) -> dict[str, bytes]:

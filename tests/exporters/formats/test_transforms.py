@@ -91,7 +91,7 @@ def test_pycolmap_reads_the_model(
     np.testing.assert_allclose(places, moved[:, :3], rtol=0, atol=1e-6)
     by_name = {image.name: image for image in model.images.values()}
     for camera in cameras:
-        image = by_name[camera.name.removeprefix("./")]
+        image = by_name[camera.name.removeprefix("./") + ("" if camera.name.endswith(".jpg") else ".png")]
         pixels = np.array([image.project_point(place) for place in places])
         np.testing.assert_allclose(pixels, project(camera, world), rtol=0, atol=1e-4)
 
@@ -145,6 +145,13 @@ def test_names_with_white_space_make_binary_files(name: str, tmp_path: Path) -> 
     ]  # fmt: skip
 
 
+def test_names_without_a_suffix_are_those_of_png_files() -> None:
+    camera = Camera("./train/r_0", np.eye(4), 4, 3, 5.0, 5.5, 2.0, 1.5)
+    cameras = [camera, replace(camera, name="a.JPG"), replace(camera, name="v1.2\\b")]
+    lines = colmap_files(cameras, box((0, 0, 0), (1, 1, 1)))["images.txt"].decode().splitlines()[1::2]
+    assert [line.split(" ", 9)[9] for line in lines] == ["train/r_0.png", "a.JPG", "v1.2/b.png"]
+
+
 def test_many_points_make_binary_files(monkeypatch: pytest.MonkeyPatch) -> None:
     camera, corners = Camera("a.png", np.eye(4), 4, 3, 5.0, 5.5, 2.0, 1.5), box((0, 0, 0), (1, 1, 1))
     monkeypatch.setattr(colmap, "MAX_TEXT_POINTS", 8)
@@ -193,7 +200,7 @@ def test_colmap_parity_of_binary_files(monkeypatch: pytest.MonkeyPatch) -> None:
         return write(model._replace(colours=np.zeros_like(model.colours)))
 
     monkeypatch.setattr(colmap, "_binary_files", renamed)
-    with pytest.raises(ParityError, match=r"images\.bin: camera: expected a b 4x3, got a c 4x3"):
+    with pytest.raises(ParityError, match=r"images\.bin: camera: expected a b\.png 4x3, got a c 4x3"):
         colmap_files([camera], corners)
     monkeypatch.setattr(colmap, "_binary_files", black)
     with pytest.raises(ParityError, match=r"points3D\.bin: expected 8 points as sampled, got 8 others"):
@@ -205,7 +212,7 @@ def test_colmap_parity(monkeypatch: pytest.MonkeyPatch) -> None:
     camera = Camera("a", np.eye(4), 4, 3, 5.0, 5.0, 2.0, 1.5)
     corners = box((0, 0, 0), (1, 1, 1))
     monkeypatch.setattr(colmap, "quaternion", lambda rotation: np.array([1.0, 0, 0, 0]))
-    with pytest.raises(ParityError, match=r"images\.txt: a: pose: 2 apart"):
+    with pytest.raises(ParityError, match=r"images\.txt: a\.png: pose: 2 apart"):
         colmap_files([camera], corners)
     monkeypatch.undo()
     monkeypatch.setattr(colmap, "_numbers", lambda values: " ".join(f"{value:.3f}" for value in values))

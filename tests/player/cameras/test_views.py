@@ -191,7 +191,7 @@ def test_colmap_views(form: str, place: str, model: Path, shells_folder: Path) -
     where = {"model": model, "scene": model.parent.parent, "file": model / f"images.{suffix}"}[place]
     views = read_views(where)
     for read, camera in zip(views, read_cameras(shells_folder / "cameras.json"), strict=True):
-        assert read.name == camera.name.removeprefix("./")
+        assert read.name == camera.name.removeprefix("./") + ".png"
         np.testing.assert_allclose(read.c2w, camera.c2w, atol=1e-9)
         for key in ("width", "height", "fx", "fy", "cx", "cy"):
             assert getattr(read, key) == pytest.approx(getattr(camera, key))
