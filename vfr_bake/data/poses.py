@@ -21,7 +21,7 @@ from player.progress import Report
 from vfr_bake.data.features import Features, pairs_to_match
 from vfr_bake.data.files import video
 from vfr_bake.data.files.estimate_record import EstimateRecord, read_record, write_record
-from vfr_bake.data.files.listing import find_pictures, other_kinds, unread_cameras
+from vfr_bake.data.files.listing import find_pictures, other_kinds, passed_over, unread_cameras
 from vfr_bake.data.files.looks import Look, look_at
 from vfr_bake.data.files.masks import check_masks, mask_of, stray_masks
 from vfr_bake.data.files.opening import SUFFIXES
@@ -143,8 +143,9 @@ def estimate_cameras(
     number of its items that are done, and the number of all. The stages are `frames` for a video, then
     `features`, `pairs`, `matches` and `cameras`; then `cameras, attempt 2` and so on if too few of a handful
     of pictures were placed; then `walk`, `turns` and `cameras again` if the model is folded. `say`: called
-    with a sentence if the folder has cameras of a form that is not read or masks of no picture, if a video
-    can be read in part only, and if the disk refuses to keep features and matches until the end.
+    with a sentence if the folder has cameras of a form that is not read, masks of no picture or pictures that
+    are not used, if a video can be read in part only, and if the disk refuses to keep features and matches
+    until the end.
 
     Pictures are turned upright as EXIF says. Those that show what another one shows are left out
     (`vfr_bake.data.files.repeats`). Pictures of one size, and of one maker, model and focal length where EXIF
@@ -182,6 +183,8 @@ def estimate_cameras(
         raise OutputError(f"{error}: copy the pictures to a folder that you can write to") from error
     if say is not None and (unread := unread_cameras(photos)):
         say(f"cameras of the form of {unread} are not read: cameras are estimated from the pictures alone")
+    if say is not None and (others := passed_over(photos)):
+        say(others)
     names = [path.relative_to(place).as_posix() for path in pictures]
     masked = [(path, mask_of(photos, name)) for path, name in zip(pictures, names, strict=True)]
     n_bytes = {name: path.stat().st_size for path, name in zip(pictures, names, strict=True)}

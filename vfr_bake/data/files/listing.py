@@ -51,7 +51,7 @@ def find_pictures(folder: Path) -> tuple[Path, list[Path]]:
 def _below(place: Path) -> list[Path]:
     found: list[Path] = []
     for path in _files(place):
-        if path.suffix.lower() in SUFFIXES and not path.name.endswith(PREVIEW) and path.is_file():
+        if _is_picture(path) and path.is_file():
             found.append(path)
         if len(found) > MOST:
             raise DataError(
@@ -68,15 +68,23 @@ def _below(place: Path) -> list[Path]:
     return found
 
 
+def _is_picture(path: Path) -> bool:
+    return path.suffix.lower() in SUFFIXES and not path.name.endswith(PREVIEW)
+
+
 def _files(place: Path) -> Iterator[Path]:
-    """Yield the files in a folder and in those within that are searched."""
-    for folder, folders, names in os.walk(place):
-        # Files whose names begin with a dot are left behind by systems (`._a.jpg` is no picture).
-        folders[:] = sorted(
-            name
-            for name in folders
-            if name[0] != "." and name not in NOT_PICTURES and not _is_own(Path(folder, name))
-        )
+    """Yield the files in a folder and in those within that are searched, each once: folders may be linked."""
+    searched = {os.path.realpath(place)}
+    for folder, folders, names in os.walk(place, followlinks=True):
+        inside, folders[:] = sorted(folders), []
+        for name in inside:
+            # Files whose names begin with a dot are left behind by systems (`._a.jpg` is no picture).
+            if name[0] == "." or name in NOT_PICTURES or _is_own(Path(folder, name)):
+                continue
+            real = os.path.realpath(Path(folder, name))
+            if real not in searched:
+                searched.add(real)
+                folders.append(name)
         yield from (Path(folder, name) for name in names if name[0] != ".")
 
 
@@ -98,6 +106,25 @@ def unread_cameras(folder: Path) -> str | None:
 def _order(name: str) -> list[tuple[int, str]]:
     return [(int(part), "") if part.isascii() and part.isdigit() else (0, part.casefold())
             for part in re.split("([0-9]+)", name)] + [(0, name)]  # fmt: skip
+
+
+def passed_over(folder: Path) -> str | None:
+    """Return a sentence on the pictures in a folder, and in those within, that `find_pictures` does not find
+    although it finds others; None if there are none. A raw file beside a photograph of its name is the same
+    picture.
+
+    >>> passed_over(Path("surely/not/there")) is None
+    True
+    """
+    place, found = find_pictures(folder)
+    names = {path.with_suffix("") for path in found}
+    files = [path for path in _files(folder) if path.with_suffix("") not in names]
+    told = []
+    if outside := sorted(path.relative_to(folder).as_posix() for path in files if _is_picture(path)):
+        told.append(f"{len(outside)} outside of {place.name}/ ({printable(outside[0][:200])})")
+    if unread := [path.suffix.lower() for path in files if path.suffix.lower() in UNREAD]:
+        told.append(f"{len(unread)} {' and '.join(sorted({*unread}))} files, which have to be saved as JPEG")
+    return f"pictures that are not used: {'; '.join(told)}" if told else None
 
 
 def other_kinds(folder: Path) -> str:

@@ -6,13 +6,15 @@ import os
 from pathlib import Path
 
 import pytest
+from PIL import Image
 
 from player.errors import DataError
 from vfr_bake.data import load_scene
 from vfr_bake.data.check.check import check_data
 from vfr_bake.data.files import listing
-from vfr_bake.data.files.listing import find_pictures, other_kinds, unread_cameras
+from vfr_bake.data.files.listing import find_pictures, other_kinds, passed_over, unread_cameras
 from vfr_bake.data.files.source import note_source
+from vfr_bake.data.poses import estimate_cameras
 from vfr_bake.data.store.working import WorkingSize
 
 
@@ -80,6 +82,37 @@ def test_images_come_first(tmp_path: Path) -> None:
     assert find_pictures(tmp_path)[0] == tmp_path / "images"
 
 
+def test_linked_folders_are_searched_once(tmp_path: Path) -> None:
+    """A link may lead out of the folder, or back into it."""
+    touch(tmp_path, "walk/1.jpg", "walk/b/2.jpg", "elsewhere/3.jpg")
+    links = {"linked": "elsewhere", "again": "elsewhere", "own": "walk/b", "b/back": "walk"}
+    for link, target in links.items():
+        (tmp_path / "walk" / link).symlink_to(tmp_path / target)
+    found = find_pictures(tmp_path / "walk")[1]
+    assert sorted(path.name for path in found) == ["1.jpg", "2.jpg", "3.jpg"]
+
+
+def test_pictures_that_are_not_used_are_told_of(tmp_path: Path) -> None:
+    """A raw file that belongs to a photograph is none, and neither is a mask."""
+    touch(tmp_path, "a.jpg", "a.dng", "masks/a.png", "walk.preview.png", "walk.mp4", "images.txt")
+    assert passed_over(tmp_path) is None
+    touch(tmp_path, "b.BMP", "in/c.dng")
+    assert passed_over(tmp_path) == (
+        "pictures that are not used: 2 .bmp and .dng files, which have to be saved as JPEG"
+    )
+    touch(tmp_path, "images/9.jpg")
+    assert passed_over(tmp_path) == (
+        "pictures that are not used: 1 outside of images/ (a.jpg); 3 .bmp and .dng files, which have to be "
+        "saved as JPEG"
+    )
+    said: list[str] = []
+    for name in ("7.jpg", "8.jpg", "9.jpg"):
+        Image.new("RGB", (40, 30)).save(tmp_path / "images" / name)
+    with pytest.raises(DataError, match="with something to recognise"):
+        estimate_cameras(tmp_path, lambda *_: None, said.append)
+    assert said == [passed_over(tmp_path)]
+
+
 @pytest.mark.parametrize("name", ["cameras_sphere.npz", "poses_bounds.npy", "pose/0_0001.txt"])
 def test_cameras_of_other_forms_are_found(tmp_path: Path, name: str) -> None:
     touch(tmp_path, "images/a.png", "intrinsics.txt", "cameras.json")
@@ -99,6 +132,7 @@ def test_a_name_that_is_no_text(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     """A file name that is not UTF-8, as Linux allows and other systems do not, is refused."""
     monkeypatch.setattr(Path, "is_file", lambda path: True)
     for folder, name in (("", "\udcff.png"), ("M\udcfcnchen", "a.png")):
-        monkeypatch.setattr(os, "walk", lambda place, at=folder, name=name: [(f"{place}/{at}", [], [name])])
+        found = (folder, [], [name])
+        monkeypatch.setattr(os, "walk", lambda place, found=found, **_: [(f"{place}/{found[0]}", *found[1:])])
         with pytest.raises(DataError, match="expected a name in UTF-8"):
             find_pictures(tmp_path)
