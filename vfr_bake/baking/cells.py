@@ -38,6 +38,9 @@ sphere of an unbounded scene. Cells of a box that are missed nevertheless are ga
 MOST_SEEING = 2_000_000
 """Most rays that search for the cells of an unbounded scene. It bounds the time, however many views there are
 and wherever they stand. Fox needs 1.2 million rays for CONTRACTED_HITS hits."""
+MOST_MARKING = 10_000_000
+"""Most rays that search for the cells of an object, for the same reason. Lego at 460 cells needs 5.2 million
+rays for HITS hits."""
 LEAST_DISTANCE = 0.5
 """Distance, model units, at which a camera counts at least. A camera at the origin, as in a walk through a
 room, would seem to meet every cell by itself, although it stands a unit away from those at the unit
@@ -231,15 +234,16 @@ def marked_cells(
 
     Views are the training cameras and as many between them. Whatever the sizes of the pictures and the
     distances of the cameras, rays are as dense as it takes for every surface cell to be met about HITS times
-    over all views, by each view as often.
+    over all views, by each view as often; but there are at most MOST_MARKING.
     """
     marks = np.zeros((*(resolution,) * 3, len(weight_floors)), np.uint8)
     cameras = model.model_cameras()
     cameras += views_between(model, len(cameras), seed=0)
     # A step no longer than a cell: samples must not skip cells, because other rays than these will be played.
     step = min(model.occupancy.step, 2 / resolution)
+    thinner = np.sqrt(rays_of_views(model, resolution) / _wanted_rays(model, resolution))
     for index, camera in enumerate(cameras):
-        density = _ray_density(camera, len(cameras), resolution)
+        density = thinner * _ray_density(camera, len(cameras), resolution)
         size = (max(1, round(camera.width * density)), max(1, round(camera.height * density)))
         rays_o, rays_d = camera.resized(*size).rays()
         mark_visible_cells(
@@ -269,6 +273,11 @@ def _footprint(camera: Camera) -> float:
 
 def rays_of_views(model: Model, resolution: int) -> float:
     """Return the expected number of rays that `marked_cells` marches."""
+    return min(_wanted_rays(model, resolution), MOST_MARKING)
+
+
+def _wanted_rays(model: Model, resolution: int) -> float:
+    """Return the number of rays with which each surface cell is met HITS times."""
     cameras = model.model_cameras()
     densities = [_ray_density(camera, 2 * len(cameras), resolution) for camera in cameras]
     return 2 * sum(d**2 * c.width * c.height for d, c in zip(densities, cameras, strict=True))
@@ -276,9 +285,9 @@ def rays_of_views(model: Model, resolution: int) -> float:
 
 def _ray_density(camera: Camera, n_views: int, resolution: int) -> float:
     """Return the camera's rays per pixel, along each image axis, with which rays of `n_views` such views meet
-    each surface cell at the middle of the box HITS times; 0.25 to 4."""
+    each surface cell at the middle of the box HITS times; 4 at most."""
     hits = VIEWS_OF_A_CELL * n_views * (2 / resolution / _footprint(camera)) ** 2
-    return float(np.clip(np.sqrt(HITS / hits), 0.25, 4.0))
+    return min(float(np.sqrt(HITS / hits)), 4.0)
 
 
 def close_gaps(cells: np.ndarray) -> np.ndarray:

@@ -75,6 +75,24 @@ def test_cells_beside_those_that_weigh_something_are_stored_where_matter_may_be(
     assert (visible & ~weighty).sum() > 100 and (held & ~visible).sum() > 100
 
 
+def test_larger_pictures_take_no_more_rays_and_all_together_not_too_many(
+    model: Model, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    n_rays = rays_of_views(model, 64)
+    large = replace(model, cameras=[camera.resized(6400, 6400) for camera in model.cameras])
+    assert rays_of_views(large, 64) == pytest.approx(n_rays)
+    marched: list[int] = []
+    monkeypatch.setattr(
+        "vfr_bake.baking.cells.mark_visible_cells", lambda rays_o, *_: marched.append(len(rays_o))
+    )
+    for most in (n_rays + 1, n_rays / 3):
+        monkeypatch.setattr("vfr_bake.baking.cells.MOST_MARKING", most)
+        marched.clear()
+        marked_cells(model, 64, (0.01,), silent)
+        assert sum(marched) == pytest.approx(min(n_rays, most), rel=0.1), "views between stand elsewhere"
+        assert rays_of_views(model, 64) == min(n_rays, most)
+
+
 def test_a_low_floor_marks_more(model: Model) -> None:
     floors = (0.2, 0.01, 0.001)
     together = marked_cells(model, 64, floors, silent)
