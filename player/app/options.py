@@ -37,8 +37,6 @@ if TYPE_CHECKING:  # the command line answers `--help` without numpy
 
 Settings = TypeVar("Settings")
 
-MAX_MEMORY = "gigabytes of memory that an asset may take when it is opened (half of the machine's)"
-
 MOST_VIEWS = 100_000
 """Most pictures of an orbit: an hour of video at 30 frames per second has 108,000."""
 
@@ -258,7 +256,8 @@ def make_parser() -> argparse.ArgumentParser:
         choices=("auto", "numpy", "numba"),
         help="what rays are marched with (numba if it is installed)",
     )
-    add("--max-memory", type=gigabytes, metavar="GB", help=MAX_MEMORY)
+    memory = "gigabytes of memory that an asset may take when it is opened (half of the machine's)"
+    add("--max-memory", type=gigabytes, metavar="GB", help=memory)
     add = parser.add_argument_group("viewer").add_argument
     add("--host", metavar="ADDRESS", help="address to serve at (127.0.0.1: this machine alone)")
     add("--port", type=whole(1, 65535, 8080), metavar="N", help="port (8080, or the next that is free)")
