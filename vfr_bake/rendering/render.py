@@ -14,6 +14,7 @@ from vfr_bake.field.field import VfrField
 from vfr_bake.rendering.compositing import composite
 from vfr_bake.rendering.occupancy import OccupancyGrid
 from vfr_bake.rendering.proposals import ProposalSampler
+from vfr_bake.torch_kernels.compositing import owners
 
 HEAD_CHUNK = 8192
 """Pixels per evaluation of the head: large enough to amortise the call, small enough to stay in cache."""
@@ -101,8 +102,7 @@ def _composited_colours(
         samples = sampler.sample_all(field, rays_o[rows], rays_d[rows])
         sigmas = field.density(samples.features)
         dirs = torch.from_numpy(rays_d[rows])
-        order = torch.argsort(samples.starts, stable=True)
-        rays = order.repeat_interleave(samples.counts[order])
+        rays = owners(samples.starts, samples.counts, len(sigmas))
         values = field.head(samples.features, dirs[rays])
         found = composite(sigmas, values, samples.deltas, samples.starts, samples.counts)
         colours[rows], opacity[rows] = found[0].numpy(), found[1].numpy()

@@ -17,7 +17,7 @@ from player.cameras.camera import Camera
 from player.errors import ConfigError, TrainingError
 from vfr_bake.config import TrainConfig
 from vfr_bake.data.scene import Scene
-from vfr_bake.data.view_pixels import ViewPixels, choose_training_pixels
+from vfr_bake.data.view_pixels import N_TRAINING_PIXELS, ViewPixels, choose_training_pixels
 from vfr_bake.data.witnesses import Witnesses, choose_witnesses
 from vfr_bake.field.field import VfrField
 from vfr_bake.field.hash_grid import Backend
@@ -28,6 +28,7 @@ from vfr_bake.rendering.occupancy import TRAINING_STEPS
 from vfr_bake.rendering.render import Sampler
 from vfr_bake.torch_kernels import can_compile
 from vfr_bake.torch_kernels.compositing import composite as composite_on_device
+from vfr_bake.torch_kernels.compositing import owners
 from vfr_bake.training.ahead import Sampled, SecondThread
 from vfr_bake.training.captures.effects import CaptureEffects, Seen
 from vfr_bake.training.device_guides import DeviceOccupancyGuide, DeviceProposalGuide
@@ -190,10 +191,11 @@ class Trainer:
         self.effects = CaptureEffects(len(witnesses.learned()), self.processes, self.device)
         """Corrections for exposure that changes and things that move, for the views that are learned from."""
 
-    def training_pixels(self) -> ViewPixels:
-        """Choose pixels for a bake to learn from, among those that this training learns from."""
-        learned = self.witnesses.learned()
-        found = choose_training_pixels(self._views, self.witnesses.patches(self._views.cameras), learned)
+    def training_pixels(self, n: int = N_TRAINING_PIXELS, everywhere: bool = False) -> ViewPixels:
+        """Choose about `n` pixels among those that this training learns from: for a bake to learn from, or
+        `everywhere`, whatever is seen there (`vfr_bake.data.view_pixels.choose_training_pixels`)."""
+        learned, patches = self.witnesses.learned(), self.witnesses.patches(self._views.cameras)
+        found = choose_training_pixels(self._views, patches, learned, n, everywhere)
         if self._masked:
             found = found.opaque()
         views = found.views()
@@ -405,9 +407,7 @@ class Trainer:
         sigmas = self._field.density(features)
         if pilot or self._field.config.compositing == "colour":
             network = self.pilot if pilot else self._field.head
-            # The samples are in the order of their rays' `starts`; with several chunks rays are not.
-            order = torch.argsort(starts)
-            values = network(features, dirs[order.repeat_interleave(counts[order])])
+            values = network(features, dirs[owners(starts, counts, len(features))])
             return self._composite(sigmas, values, samples.deltas, starts, counts)
         composited, opacity, weights = self._composite(sigmas, features, samples.deltas, starts, counts)
         return self._field.head(composited, dirs) * opacity[:, None], opacity, weights
