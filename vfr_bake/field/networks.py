@@ -182,13 +182,13 @@ class HeadNetwork(nn.Module):
 class Pilot(nn.Module):
     """The pilot network, which gives a colour to every sample of a batch of rays."""
 
-    def __init__(self, config: FieldConfig, width: int = 64) -> None:
+    def __init__(self, config: FieldConfig) -> None:
         super().__init__()
         self.harmonics = SphericalHarmonics(config.sh_degree)
         self.layers = nn.ModuleList(
-            [nn.Linear(config.n_channels + config.sh_degree**2, width), nn.Linear(width, width)]
+            [nn.Linear(config.n_channels + config.sh_degree**2, 64), nn.Linear(64, 64)]
         )
-        self.out = nn.Linear(width, 3)
+        self.out = nn.Linear(64, 3)
         initialise(self.layers)
 
     def forward(self, features: Tensor, dirs: Tensor) -> Tensor:

@@ -83,11 +83,6 @@ class CaptureEffects:
         self._left_out = self._contradicting
 
     @property
-    def n_steps(self) -> int:
-        """Number of steps that were observed."""
-        return self._n_steps
-
-    @property
     def looks(self) -> bool:
         """True if steps still have to be observed."""
         return self.exposure_on or self.moving_on or self._n_steps < CHECKS[-1]
