@@ -33,6 +33,8 @@ EVAL_VIEWS = {False: 10, True: 3}
 EVAL_SHARE, LEAST_EVAL_SECONDS = 0.2, 60.0
 """If none is asked for, test views take at most this share of the training's time, or these seconds if that
 is more: then fewer are rendered, but at least one."""
+N_LEARNED = 10_000
+"""Pixels that training has learned from, at which it is measured: a second or two for a scene."""
 
 GLANCED_AT = 24
 """Most pictures that a run looks at before it begins; `--check` looks at as many as ten seconds allow."""
@@ -99,22 +101,23 @@ def _finish(options: Any, trainer: Trainer, scene: Scene, figures: dict[str, Any
     """Write the model, measure it, and report; return whether Ctrl-C was pressed, in training or here.
 
     Ctrl-C during the measurements ends them: the model is complete, and is reported without them. An
-    `interrupted` training is not measured, and leaves a checkpoint.
+    `interrupted` training is measured only on what it has learned from, and leaves a checkpoint.
     """
     from vfr_bake.training.checkpoint import checkpoint_path
     from vfr_bake.training.model_file import save_model, trained_model
+    from vfr_bake.training.scores.evaluation import training_psnr
 
     checkpoint, config = checkpoint_path(options.model), trainer.config
     stopped, witnesses = interrupted, None
-    if not stopped:
-        try:
-            witnesses = trainer.witness_psnr()
-        except KeyboardInterrupt:
-            stopped = True
+    model = trained_model(trainer, scene, figures)
+    try:
+        figures["training_psnr"] = training_psnr(model, trainer.training_pixels(N_LEARNED, everywhere=True))
+        witnesses = None if interrupted else trainer.witness_psnr()
+    except KeyboardInterrupt:
+        stopped = True
     if witnesses is not None:
         figures["witness_psnr"] = {"patches": witnesses.patches, "whole": witnesses.whole}
-    model = trained_model(trainer, scene, figures)
-    save_model(options.model, model)
+    save_model(options.model, replace(model, figures=figures))
     n_views, most_seconds = config.eval_views, math.inf
     if n_views is None:
         n_views = EVAL_VIEWS[scene.unbounded]
@@ -322,7 +325,6 @@ def _train_steps(trainer: Trainer, checkpoint: Path, preview: Preview | None) ->
         "seconds": round(trainer.seconds, 1),
         "ended_early": trainer.duration.ended_early,
         "skipped_steps": trainer.n_bad_steps,
-        "training_psnr": round(decibels(error), 3) if error else None,
         "interrupted": interrupted,
     }
 

@@ -76,10 +76,15 @@ class ViewPixels:
 
 
 def choose_training_pixels(
-    views: PosedImages, apart: Sequence[np.ndarray], learned: np.ndarray
+    views: PosedImages,
+    apart: Sequence[np.ndarray],
+    learned: np.ndarray,
+    n: int = N_TRAINING_PIXELS,
+    everywhere: bool = False,
 ) -> ViewPixels:
-    """Choose pixels of training `views`: about as many of each of the views in `learned`, spread evenly over
-    it. Those that are set apart, `apart` [n_apart] int64 of each view, are left out.
+    """Choose about `n` pixels of training `views`: as many of each of the views in `learned`, spread evenly
+    over it. Those that are set apart, `apart` [n_apart] int64 of each view, are left out, and so are those
+    that are not near anything, but not if pixels are wanted `everywhere`.
 
     >>> from vfr_bake.data.demo import demo_views
     >>> train, _ = demo_views(16, 3, 1)
@@ -90,9 +95,9 @@ def choose_training_pixels(
     random = np.random.default_rng(SEED)
     counts, pixels = np.zeros(len(views.cameras), np.int32), []
     for view in learned:
-        near = None if views.opaque(view) else _near_something(views.images[view][..., 3])
+        near = None if everywhere or views.opaque(view) else _near_something(views.images[view][..., 3])
         of = views.cameras[view].width * views.cameras[view].height if near is None else len(near)
-        kept = spread(min(N_TRAINING_PIXELS // len(learned), of), of, random)
+        kept = spread(min(max(n // len(learned), 1), of), of, random)
         kept = np.setdiff1d(kept if near is None else near[kept], apart[view])
         counts[view] = len(kept)
         pixels.append(kept)

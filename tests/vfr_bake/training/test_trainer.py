@@ -31,7 +31,8 @@ from vfr_bake.training.model_file import trained_model
 from vfr_bake.training.optimiser import DENSITY_DECAY
 from vfr_bake.training.processes import Processes
 from vfr_bake.training.rays import Batch, PixelSampler, RayBatch
-from vfr_bake.training.scores.evaluation import render_views
+from vfr_bake.training.scores.evaluation import render_views, training_psnr
+from vfr_bake.training.scores.metrics import decibels
 from vfr_bake.training.trainer import Trainer
 
 FIELD = FieldOptions(n_levels=8, max_resolution=64, log2_table_size=14, head_width=32, density_width=16)
@@ -328,6 +329,21 @@ def test_each_process_goes_on_with_its_own_share(scene: Scene, monkeypatch: pyte
         monkeypatch.setattr(trainer, "_error", spy)
         next(trainer.run())
     assert not torch.equal(*served)
+
+
+def test_the_error_of_a_training_is_that_of_whole_pictures(scene: Scene) -> None:
+    """It is neither that of the pixels that steps draw, most of which show detail, nor that of the pixels for
+    a bake, all of which are near the object."""
+    trainer = Trainer(scene, config(steps=120, pilot_steps=20))
+    for _ in trainer.run():
+        pass
+    model = trained_model(trainer, scene, {})
+    learned = render_views(model, scene.train, trainer.witnesses.learned())
+    whole = decibels(float(np.mean([(view.rgb - view.photograph) ** 2 for view in learned])))
+    found = training_psnr(model, trainer.training_pixels(10_000, everywhere=True))
+    assert found == pytest.approx(whole, abs=0.3)
+    near = training_psnr(model, trainer.training_pixels())
+    assert near is not None and near < whole - 1
 
 
 def test_a_restored_training_holds_its_pictures_once(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:

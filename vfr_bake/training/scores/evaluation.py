@@ -16,10 +16,11 @@ import numpy as np
 from player.progress import Progress
 from vfr_bake.data.capture import PosedImages
 from vfr_bake.data.scene import Scene, evenly
-from vfr_bake.rendering.render import render_camera
+from vfr_bake.data.view_pixels import ViewPixels
+from vfr_bake.rendering.render import render_camera, render_rays
 from vfr_bake.training.captures.picture_colours import fitted
 from vfr_bake.training.model_file import Model
-from vfr_bake.training.scores.metrics import Distance, ViewScore, over_background, score_view
+from vfr_bake.training.scores.metrics import Distance, ViewScore, decibels, over_background, score_view
 from vfr_bake.training.scores.views import hidden_lines, seen_views, spread_order
 
 
@@ -97,6 +98,16 @@ def beside_photograph(
         seen = rgba[..., 3] == 255
         photograph = np.where(seen[..., None], photograph, rgb)
     return RenderedView(name, rgb, photograph, seen, first_column)
+
+
+def training_psnr(model: Model, pixels: ViewPixels) -> float | None:
+    """Return the PSNR in dB of the model's colours at `pixels` of the pictures that it was trained on; None
+    if there are none, or it has no bound."""
+    wanted = over_background(model.neutral(pixels).rgba, model.background)
+    colours, opacity = render_rays(model.field, model.sampler, *model.rays(pixels))
+    errors = colours + (1 - opacity[:, None]) * model.background - wanted
+    error = float((errors**2).sum()) / max(errors.size, 1)
+    return decibels(error) if error > 0 else None
 
 
 def quick_psnr(
