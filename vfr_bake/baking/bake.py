@@ -150,7 +150,7 @@ class _Bake:
             with self._part("pace"):
                 self.choice = self._in_time(stored, layout, self.config.target_ms)
         left = refinement_seconds(self.choice, time.monotonic() - self._begun)
-        tuning = Tuning(self.config, self.choice, self.held_out, self._progress, left)
+        tuning = Tuning(self.config, self.choice, self.held_out, self._report, left)
         with self._part("refinement"):
             stored = tuning.run(stored, layout, teacher, again)
         self.n_fetches, self.lookups = tuning.n_fetches, tuning.lookups
@@ -161,7 +161,7 @@ class _Bake:
         if self.config.max_loss_db is not None:
             left_db = self.config.max_loss_db - tuning.kept.loss.db
             most_db = min(most_db, max(DETAIL_SHARE * left_db, 0.0))
-        detail = Detail(self.held_out, played, self.n_fetches, most_db, self._progress("detail"))
+        detail = Detail(self.held_out, played, self.n_fetches, most_db, partial(self._report, "detail"))
         with self._part("detail"):
             needed = self._needed(detail, layout, stored, teacher)
         self.left_out |= detail.left_out
@@ -209,7 +209,7 @@ class _Bake:
         it leaves memory."""
         model, plan = self.model, self.plan
         with self._part("visibility"):
-            progress = self._progress("visibility")
+            progress = partial(self._report, "visibility")
             visible, step, left_out = find_cells(
                 model, self.config, plan.resolutions, self.held_out, progress
             )
@@ -264,16 +264,17 @@ class _Bake:
             n_photographed = photographed(model, n_rays)
             if not n_photographed:
                 views = cameras + views
-            teacher = render_teacher(model, views, n_rays - n_photographed, 0, self._progress("teacher"))
+            progress = partial(self._report, "teacher")
+            teacher = render_teacher(model, views, n_rays - n_photographed, 0, progress)
             if n_photographed:
-                progress = self._progress("photographs")
+                progress = partial(self._report, "photographs")
                 teacher = teacher.and_those(photographed_rays(model, n_photographed, progress))
         with self._part("grid"):
-            density = evaluate_densities(model, layout, self._progress("densities"))
+            density = evaluate_densities(model, layout, partial(self._report, "densities"))
             projection = self._projection(teacher)
             step = code_step(some_features(model, layout, projection.matrix), choice.code_levels)
             matrix = projection.matrix / step
-            features = latent_features(model, layout, matrix, self._progress("features"))
+            features = latent_features(model, layout, matrix, partial(self._report, "features"))
             first = model.field.head.first_weights().astype(np.float64)
             head = fold_head(model.field.head, first @ projection.back * step)
             grid = layout.grid(density, features)
@@ -344,7 +345,7 @@ class _Bake:
                 return after.loss.db - refined.loss.db
             return held_out.loss_of_change(refined.shown, after.shown)
 
-        search = PriceSearch(prices, loss_db, held_out.model_error, self._progress("codes"))
+        search = PriceSearch(prices, loss_db, held_out.model_error, partial(self._report, "codes"))
         price = search.for_preset(self.choice.code_loss_db) if left is None else search.for_loss(left)
         if config.max_mb is not None:
             others = head_bytes + len(write_cameras(self.model.cameras)) + MANIFEST_BYTES
@@ -445,9 +446,6 @@ class _Bake:
             f"{name}: baked with preset {self.config.preset}", self._asked(), self.held_out.table(),
             self.held_out.measured_on(), n_bytes, seconds, self.left_out, self.lookups, missed, pictures,
         )  # fmt: skip
-
-    def _progress(self, name: str) -> Callable[[int, int], object]:
-        return lambda done, of: self._report(name, done, of)
 
     @contextmanager
     def _part(self, name: str) -> Iterator[None]:

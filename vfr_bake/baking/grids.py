@@ -372,18 +372,12 @@ def whole_codes(features: np.ndarray) -> np.ndarray:
     return whole
 
 
-def remainders(features: np.ndarray) -> np.ndarray:
-    """Return what `whole_codes` rounds away from latent features [n_vertices, n_stored]: their low bytes, as
-    int8."""
-    return features.astype(np.int8)
-
-
 def with_remainders(whole: np.ndarray, left: np.ndarray) -> Parts:
-    """Yield, part by part, the latent features of which `whole` are the `whole_codes` and `left` the
-    `remainders`.
+    """Yield, part by part, the latent features of which `whole` are the `whole_codes` and `left`, int8, the
+    low bytes: what is rounded away.
 
     >>> features = latent(np.array([[1.25, -3.5]]))
-    >>> [part.tolist() for _, part in with_remainders(whole_codes(features), remainders(features))]
+    >>> [part.tolist() for _, part in with_remainders(whole_codes(features), features.astype(np.int8))]
     [[[320, -896]]]
     """
     for first in range(0, len(whole), ROWS_AT_ONCE):

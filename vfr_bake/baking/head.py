@@ -180,13 +180,12 @@ def runner(
     return partial(head_colours, FoldedHead(weights, ranges=ranges))
 
 
-def between(first: HeadWeights, second: HeadWeights, share: float) -> HeadWeights:
-    """Interpolate the weights of two heads with layers of the same sizes: a `share` of the way from `first`
-    to `second`."""
+def between(first: HeadWeights, second: HeadWeights) -> HeadWeights:
+    """Return the head halfway between two heads with layers of the same sizes."""
 
     def mixed(a: Any, b: Any) -> Any:
         if isinstance(a, tuple):
             return tuple(mixed(*two) for two in zip(a, b, strict=True))
-        return a + share * (b - a) if isinstance(a, np.ndarray) else a
+        return a + (b - a) / 2 if isinstance(a, np.ndarray) else a
 
     return HeadWeights(**{name: mixed(value, vars(second)[name]) for name, value in vars(first).items()})

@@ -14,6 +14,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import torch
@@ -27,7 +28,7 @@ from player.asset.grid import SparseGrid
 from player.march.march import MAX_TAU
 from player.progress import Progress
 from vfr_bake.baking.distillation import TeacherRays, TrainingRays, collect_training_rays
-from vfr_bake.baking.grids import Layout, Parts, move_towards, remainders, whole_codes, with_remainders
+from vfr_bake.baking.grids import Layout, Parts, move_towards, whole_codes, with_remainders
 from vfr_bake.baking.head import FoldedHead, between, runner, small_head
 from vfr_bake.baking.held_out import HeldOut, Stage
 from vfr_bake.baking.limits import LOOKUPS
@@ -140,7 +141,7 @@ class Tuning:
         config: BakeConfig,
         choice: BakeChoice,
         held_out: HeldOut,
-        progress: Callable[[str], Progress],
+        report: Callable[[str, int, int], object],
         seconds: float,
     ) -> None:
         """`seconds` is the time that all rounds together may take, if the number of steps was not given."""
@@ -153,7 +154,7 @@ class Tuning:
         self.left_out: dict[str, str] = {}
         """Descriptions, by topic, of what was left out and what that changed."""
         self._config, self._choice = config, choice
-        self._held_out, self._progress = held_out, progress
+        self._held_out, self._report = held_out, report
         self._until = time.monotonic() + (seconds if config.refine_steps is None else float("inf"))
 
     def run(self, stored: Stored, layout: Layout, teacher: TeacherRays, again: Callable[[], Parts]) -> Stored:
@@ -189,7 +190,7 @@ class Tuning:
         else:
             del grid
             move_towards(stored.features, again(), 0.5)
-            head, density = between(stored.head, tuned.head, 0.5), (stored.density + tuned.density) / 2
+            head, density = between(stored.head, tuned.head), (stored.density + tuned.density) / 2
             tuned = Stored(head, stored.features, density)
             grid = layout.grid(tuned.density, tuned.features)
             after = self._held_out.measure("half refined", grid, runner(tuned.head), 0)
@@ -241,7 +242,8 @@ class Tuning:
         """Refine head and features with the lookups and bits that are played, and keep the result if it gains
         anything. Changes the features of `stored` in place."""
         rays = collect_training_rays(teacher, grid, self.n_fetches)
-        asked, left = refined_steps(self._config, self._choice, len(rays)), remainders(stored.features)
+        asked = refined_steps(self._config, self._choice, len(rays))
+        left = stored.features.astype(np.int8)  # the low bytes, which `whole_codes` rounds away
         with self._steps("refinement at k", asked) as steps:
             tuned = refine(stored, rays, steps, None, head_rate, code_rate, self.ranges)
         played, grid = grid.features, replace(grid, features=whole_codes(tuned.features))
@@ -263,7 +265,7 @@ class Tuning:
         seconds = SHARES[name] * self._seconds_left()
         if name == "head at k":
             seconds = max(seconds, HEAD_SECONDS)
-        yield (steps := Steps(asked, self._progress(name), seconds))
+        yield (steps := Steps(asked, partial(self._report, name), seconds))
         self._until += steps.paused
         if steps.n < asked:
             self.left_out[f"steps of {name!r}"] = (

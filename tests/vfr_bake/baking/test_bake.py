@@ -237,7 +237,7 @@ def test_a_round_that_gains_nothing_leaves_what_was_stored(
     density, features = stored.density.copy(), stored.features.copy()
     assert (features % PARTS).any(), "codes that are not whole yet"
     monkeypatch.setattr("vfr_bake.baking.refinement.Tuning._gained", lambda *_: False)
-    tuning = Tuning(config, work.choice, work.held_out, lambda name: lambda done, of: None, 60.0)
+    tuning = Tuning(config, work.choice, work.held_out, lambda *_: None, 60.0)
     left = tuning.run(stored, layout, teacher, again)
     np.testing.assert_array_equal(left.density, density)
     np.testing.assert_array_equal(left.features, features)
@@ -262,7 +262,7 @@ def test_a_head_in_8_bits_that_loses_too_much_is_played_in_float32(
     monkeypatch.setattr("vfr_bake.baking.refinement.ROUNDING_LEFT", -np.inf)  # 8 bits are tried
     monkeypatch.setattr("vfr_bake.baking.refinement.WORTH_FEATURES", worth)
     monkeypatch.setattr("vfr_bake.baking.refinement.Tuning._gained", lambda *_: True)
-    tuning = Tuning(config, work.choice, work.held_out, lambda name: lambda done, of: None, 600.0)
+    tuning = Tuning(config, work.choice, work.held_out, lambda *_: None, 600.0)
     left = tuning.run(stored, layout, teacher, again)
     assert (tuning.ranges is None) == (share < 0)
     if share < 0:  # the features are those that the head was measured with
@@ -288,7 +288,7 @@ def test_half_a_round_is_kept_where_all_of_it_loses(model: Model, monkeypatch: p
     answers = iter([False, True])
     monkeypatch.setattr("vfr_bake.baking.refinement.refine", moved)
     monkeypatch.setattr("vfr_bake.baking.refinement.Tuning._gained", lambda *_: next(answers, False))
-    tuning = Tuning(config, work.choice, work.held_out, lambda name: lambda done, of: None, 60.0)
+    tuning = Tuning(config, work.choice, work.held_out, lambda *_: None, 60.0)
     before = stored.head
     left = tuning.run(stored, layout, teacher, again)
     assert "half" in tuning.left_out["refinement"]

@@ -118,7 +118,7 @@ def test_a_head_that_was_timed_in_8_bits_keeps_them(
     layout, _ = work._cells()
     stored, teacher, again = work._store(layout, 20_000)
     monkeypatch.setattr(work.held_out, "lost", lambda before, after: Loss(9.0, 0.0))
-    tuning = Tuning(config, work.choice, work.held_out, lambda name: lambda done, of: None, 60.0)
+    tuning = Tuning(config, work.choice, work.held_out, lambda *_: None, 60.0)
     tuning.run(stored, layout, teacher, again)
     assert (tuning.ranges is None) == (target_ms is None)
 

@@ -86,13 +86,8 @@ def test_lookups_are_enough_for_pixels_not_to_stand_out(
 
     monkeypatch.setattr(refinement, "runner", lambda head: head)
     monkeypatch.setattr(refinement, "LOOKUPS", (2, 4, 8, 12))
-    tuning = refinement.Tuning(
-        BakeConfig(preset="fast"),
-        PRESETS["fast"],
-        Seen(),
-        lambda name: silent,
-        1.0,  # type: ignore[arg-type]
-    )
+    config = BakeConfig(preset="fast")
+    tuning = refinement.Tuning(config, PRESETS["fast"], Seen(), lambda *_: None, 1.0)  # type: ignore[arg-type]
     assert tuning._choose_lookups(None, None) == tuning.n_fetches == k  # type: ignore[arg-type]
     assert set(tuning.lookups.values()) == {0.0}
 
@@ -101,7 +96,7 @@ def test_a_pause_in_a_round_takes_no_time_from_the_next(monkeypatch: pytest.Monk
     now = 0.0
     clock = SimpleNamespace(monotonic=lambda: now, perf_counter=lambda: now)
     monkeypatch.setattr(refinement, "time", clock)
-    tuning = refinement.Tuning(BakeConfig(), PRESETS["fast"], None, lambda name: silent, 100.0)  # type: ignore[arg-type]
+    tuning = refinement.Tuning(BakeConfig(), PRESETS["fast"], None, lambda *_: None, 100.0)  # type: ignore[arg-type]
     with tuning._steps("refinement", 1000) as steps:
         for step in steps:
             now += 2**-6

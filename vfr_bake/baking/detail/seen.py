@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import get_num_threads
 
-from player.asset.bricks import bricks_per_axis, dense_index, stored_bits
+from player.asset.bricks import bricks_per_axis, dense_index, unpack_vertices
 from player.asset.grid import SparseGrid
 from player.asset.pyramid import Bricks, corners_of, packed_bits
 from player.cameras.camera import Camera
@@ -74,8 +74,8 @@ def live_of_blocks(blocks: np.ndarray) -> np.ndarray:
     """Return masks [n_bricks, 8] uint64 of the cells in the marked `blocks` [n_bricks, 4, 4, 4] bool.
 
     >>> masks = live_of_blocks(np.arange(64).reshape(1, 4, 4, 4) == 1)
-    >>> np.flatnonzero(stored_bits(masks)).tolist()
-    [2, 3, 10, 11, 66, 67, 74, 75]
+    >>> unpack_vertices(np.zeros((1, 3), np.uint16), masks).tolist()
+    [[0, 0, 2], [0, 0, 3], [0, 1, 2], [0, 1, 3], [1, 0, 2], [1, 0, 3], [1, 1, 2], [1, 1, 3]]
     """
     for axis in (1, 2, 3):
         blocks = blocks.repeat(2, axis=axis)
@@ -108,16 +108,14 @@ def overlapping(cells: Bricks, resolution: int, others: Bricks, of_others: int) 
     >>> cells = Bricks(np.zeros((1, 3), np.uint16), np.array([[1 << 2, 0, 0, 0, 0, 0, 0, 0]], np.uint64))
     >>> every = Bricks(np.zeros((1, 3), np.uint16), np.full((1, 8), ~np.uint64(0)))
     >>> found = overlapping(cells, 8, every, 5)  # 2/8 to 3/8 of the edge: 1.25 to 1.875 of its cells
-    >>> np.flatnonzero(stored_bits(found.masks)).tolist()
-    [1]
+    >>> unpack_vertices(found.coords, found.masks).tolist()
+    [[0, 0, 1]]
     """
     table = dense_index(others.coords, bricks_per_axis(of_others))
     marked = np.zeros(len(others) * 512, bool)
     for first in range(0, len(cells), BRICKS_AT_ONCE):
         rows = slice(first, first + BRICKS_AT_ONCE)
-        brick, bit = np.nonzero(stored_bits(cells.masks[rows]))
-        local = np.stack([bit >> 6, (bit >> 3) & 7, bit & 7], axis=-1)
-        index = cells.coords[rows].astype(np.int64)[brick] * 8 + local
+        index = unpack_vertices(cells.coords[rows], cells.masks[rows])
         ends = index * of_others // resolution, ((index + 1) * of_others - 1) // resolution
         for corner in product((0, 1), repeat=3):
             at = np.stack([ends[end][:, axis] for axis, end in enumerate(corner)], axis=-1)
