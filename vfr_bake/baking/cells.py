@@ -244,8 +244,7 @@ def marked_cells(
     thinner = np.sqrt(rays_of_views(model, resolution) / _wanted_rays(model, resolution))
     for index, camera in enumerate(cameras):
         density = thinner * _ray_density(camera, len(cameras), resolution)
-        size = (max(1, round(camera.width * density)), max(1, round(camera.height * density)))
-        rays_o, rays_d = camera.resized(*size).rays()
+        rays_o, rays_d = camera.scaled(density).rays()
         mark_visible_cells(
             rays_o, rays_d, np.float32(step), model.occupancy.distance,
             model.field.arrays(), LIMITS, np.array(weight_floors, np.float32), marks,
