@@ -29,8 +29,8 @@ from vfr_bake.data.files.estimate_record import read_record
 from vfr_bake.data.files.listing import find_pictures, other_kinds
 from vfr_bake.data.files.masks import mask_of, stray_masks
 from vfr_bake.data.files.opening import SUFFIXES, open_photograph
-from vfr_bake.data.files.orientation import PictureHeader, is_taken_upright, read_layout
-from vfr_bake.data.files.pictures import DescribedView, read_picture
+from vfr_bake.data.files.orientation import is_taken_upright
+from vfr_bake.data.files.pictures import DescribedView, picture_layout, read_picture
 from vfr_bake.data.store.reading import PictureReader
 
 DISTORTION_KEYS = ("k1", "k2", "k3", "k4", "p1", "p2")
@@ -171,7 +171,7 @@ def _described_views(
     is decoded. `say`: called with a sentence if frames are repeated."""
     frames: list[dict[str, Any]] = document["frames"]
     paths = [_picture_path(path, index, frame) for index, frame in enumerate(frames)]
-    layouts = [_layout(picture) for picture in paths]
+    layouts = [picture_layout(picture) for picture in paths]
     upright = [
         is_taken_upright(layout, _given_size(document, path, index)) for index, layout in enumerate(layouts)
     ]
@@ -251,13 +251,6 @@ def _check_shape(where: str, picture: Path, camera: Camera, size: tuple[int, int
             f"got {size[0]}x{size[1]} in {picture.name}: take the picture that belongs to the camera, "
             "neither cropped nor turned, or give the camera of this picture"
         )
-
-
-def _layout(picture: Path) -> PictureHeader:
-    try:
-        return read_layout(picture)
-    except FormatError as error:
-        raise DataError(str(error)) from error
 
 
 def _given_size(document: dict[str, Any], path: Path, index: int) -> tuple[float, float] | None:
@@ -363,7 +356,7 @@ def load_colmap_folder(
         picture = _colmap_picture(folder, image.name)
         if record.n_bytes.get(image.name, n_bytes := picture.stat().st_size) != n_bytes:
             replaced.append(image.name)
-        layout = _layout(picture)
+        layout = picture_layout(picture)
         turned = record.upright or is_taken_upright(layout, size)
         shape = layout.upright_size if turned else layout.size
         _check_shape(f"{model}: {image.name}", picture, camera, shape)

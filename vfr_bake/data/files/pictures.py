@@ -15,7 +15,7 @@ from player.files.files import open_file, read_bytes
 from player.files.images import MAX_FILE_BYTES
 from vfr_bake.data.capture import PosedImages
 from vfr_bake.data.files.opening import open_photograph
-from vfr_bake.data.files.orientation import as_stored, layout_of, read_layout, turned_upright
+from vfr_bake.data.files.orientation import PictureHeader, as_stored, layout_of, read_layout, turned_upright
 from vfr_bake.data.files.profiles import as_srgb, coded_profile
 
 SHARPNESS_SIDE = 800
@@ -52,11 +52,16 @@ def viewed_size(view: DescribedView) -> tuple[int, int]:
 def picture_size(path: Path, upright: bool = False) -> tuple[int, int]:
     """Return the width and height of a picture as `read_picture` returns it, without decoding the file.
     Raises DataError."""
+    layout = picture_layout(path)
+    return layout.upright_size if upright else layout.size
+
+
+def picture_layout(path: Path) -> PictureHeader:
+    """Return what the header of a picture says. Raises DataError."""
     try:
-        layout = read_layout(path)
+        return read_layout(path)
     except FormatError as error:
         raise DataError(str(error)) from error
-    return layout.upright_size if upright else layout.size
 
 
 def reduced(views: PosedImages, factor: int) -> PosedImages:
@@ -228,10 +233,9 @@ def sharpness(cv2: Any, image: np.ndarray) -> float:
 def shrunk(cv2: Any, image: np.ndarray, side: int, interpolation: int | None = None) -> np.ndarray:
     """Return a picture reduced by OpenCV until no side is longer than `side` pixels, by areas unless an
     `interpolation` is given."""
-    scale = side / max(image.shape[:2])
-    if scale >= 1:
+    if max(image.shape[:2]) <= side:
         return image
-    size = (max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale)))
+    size = enough_for((image.shape[1], image.shape[0]), side)
     return cv2.resize(image, size, interpolation=cv2.INTER_AREA if interpolation is None else interpolation)
 
 

@@ -16,6 +16,7 @@ from vfr_bake.data.files.masks import apply_mask
 from vfr_bake.data.files.pictures import (
     BYTES_DECODED,
     DescribedView,
+    enough_for,
     opencv,
     premultiplied,
     read_picture,
@@ -51,11 +52,7 @@ class WorkingSize:
         """
         if self.downscale is not None:
             return max(1, width // self.downscale), max(1, height // self.downscale)
-        longest = max(width, height)
-        if self.max_side is None or longest <= self.max_side:
-            return width, height
-        scale = self.max_side / longest
-        return max(1, round(width * scale)), max(1, round(height * scale))
+        return (width, height) if self.max_side is None else enough_for((width, height), self.max_side)
 
     def reading_bytes(self, view: DescribedView, size: tuple[int, int]) -> int:
         """Return the approximate number of bytes of memory that are taken while a picture of `size` is
