@@ -18,7 +18,7 @@ from vfr_bake.data.files.listing import find_pictures
 from vfr_bake.data.files.source import check_source
 from vfr_bake.data.files.video import frames_folder
 from vfr_bake.data.folders import has_transforms, load_folder
-from vfr_bake.data.poses import has_pictures, is_video
+from vfr_bake.data.poses import is_video
 from vfr_bake.data.scene import PosedImages, Scene, build_scene
 from vfr_bake.data.store.reading import PictureReader
 from vfr_bake.data.store.working import MAX_SIDE, WorkingSize
@@ -143,4 +143,4 @@ def needs_cameras(data: str | Path) -> bool:
     if is_video(folder):
         return True
     known = not folder.is_dir() or has_transforms(folder) or colmap_folder(folder) is not None
-    return not known and has_pictures(folder)
+    return not known and bool(find_pictures(folder)[1])

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import struct
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -39,7 +39,7 @@ from vfr_bake.data.mapping import (
     refine_principal_points,
     write_database,
 )
-from vfr_bake.data.models.folds import agreeing_pairs, near_pairs, torn_neighbours
+from vfr_bake.data.models.folds import agreeing_pairs, is_near, torn_neighbours
 from vfr_bake.data.models.joining import joined
 from vfr_bake.data.world import find_up, turn_to_z
 
@@ -125,11 +125,6 @@ def is_video(path: Path) -> bool:
     False
     """
     return path.suffix.lower() in video.SUFFIXES and path.is_file()
-
-
-def has_pictures(folder: Path) -> bool:
-    """Return whether `estimate_cameras` finds pictures in `folder`."""
-    return bool(find_pictures(folder)[1])
 
 
 def estimate_cameras(
@@ -338,7 +333,7 @@ def _placed(
             models = max(models, again, key=lambda found: found[0].num_reg_images() if found else 0)
     if not models or not n_torn(models):
         return models
-    walk = built(near_pairs(pairs), "walk")
+    walk = built([pair for pair in pairs if is_near(pair)], "walk")
     if not enough(walk) or n_torn(walk) >= n_torn(models):
         return models  # the pictures are not of one walk
     agreeing = agreeing_pairs(walk[0], names, features, pairs, lambda *n: progress("turns", *n))
@@ -346,16 +341,26 @@ def _placed(
     return closed if enough(closed) and n_torn(closed) <= n_torn(walk) else walk
 
 
+def connected(numbers: Iterable[int], pairs: Iterable[tuple[int, int]]) -> list[set[int]]:
+    """Return the groups into which `pairs` connect `numbers`.
+
+    >>> connected(range(4), [(0, 2), (3, 2)])
+    [{0, 2, 3}, {1}]
+    """
+    groups = {number: {number} for number in numbers}
+    for i, j in pairs:
+        if groups[i] is not groups[j]:
+            groups[i] |= groups[j]
+            groups |= dict.fromkeys(groups[j], groups[i])
+    return list({id(group): group for group in groups.values()}.values())
+
+
 def _places(names: Sequence[str], pairs: Sequence[Pair]) -> str:
     """Return a clause on the groups that the pictures fall into if the groups have nothing in common; empty
     for one group."""
-    groups = {number: {number} for number in range(len(names))}
-    for pair in pairs:
-        if groups[pair.i] is not groups[pair.j]:
-            groups[pair.i] |= groups[pair.j]
-            groups |= dict.fromkeys(groups[pair.j], groups[pair.i])
-    distinct = {id(group): group for group in groups.values() if len(group) >= MIN_PICTURES}
-    large = sorted(distinct.values(), key=lambda group: (-len(group), min(group)))
+    groups = connected(range(len(names)), [(pair.i, pair.j) for pair in pairs])
+    large = [group for group in groups if len(group) >= MIN_PICTURES]
+    large.sort(key=lambda group: (-len(group), min(group)))
     if len(large) < 2:
         return ""
     named = " and ".join(f"{len(group)} ({names[min(group)]} to {names[max(group)]})" for group in large[:3])

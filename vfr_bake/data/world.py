@@ -174,15 +174,11 @@ def named(names: Sequence[str], name: str) -> list[int]:
     >>> named(["a/1.jpg", "b/1.jpg", "b/2.jpg"], "2"), named(["a/1.jpg", "b/1.jpg"], "1.jpg")
     ([2], [0, 1])
     """
-    for form in (_whole, _last, _stem):
+    for form in (str, _last, _stem):
         found = [number for number, other in enumerate(names) if form(other) == form(name)]
         if found:
             return found
     return []
-
-
-def _whole(name: str) -> str:
-    return name
 
 
 def _last(name: str) -> str:

@@ -16,12 +16,12 @@ import pytest
 from PIL import Image
 
 from player.errors import DataError, FormatError, MissingExtraError, OutputError
-from vfr_bake.data import mapping, poses
+from vfr_bake.data import mapping, needs_cameras, poses
 from vfr_bake.data.check.check import check_data
 from vfr_bake.data.features import find_features, match
 from vfr_bake.data.files.estimate_record import read_record
 from vfr_bake.data.folders import load_folder
-from vfr_bake.data.poses import added_since, estimate_cameras, has_pictures
+from vfr_bake.data.poses import added_since, estimate_cameras
 from vfr_bake.data.store.working import WorkingSize
 
 N_CAN = 10
@@ -329,7 +329,7 @@ def test_pictures_of_another_kind_are_named(tmp_path: Path):
     (tmp_path / "a.DNG").write_bytes(b"")
     (tmp_path / "._a.jpg").write_bytes(b"")
     assert message(tmp_path).endswith("got 0; there are .dng files: save them as JPEG")
-    assert not has_pictures(tmp_path)
+    assert not needs_cameras(tmp_path)
 
 
 def test_nothing_there_and_a_file_of_another_kind(tmp_path: Path):

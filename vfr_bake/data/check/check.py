@@ -27,7 +27,7 @@ from vfr_bake.data.files.masks import mask_of
 from vfr_bake.data.files.pictures import DescribedView, picture_size
 from vfr_bake.data.files.video import extract_frames
 from vfr_bake.data.folders import has_transforms, load_folder
-from vfr_bake.data.poses import added_since, is_video
+from vfr_bake.data.poses import added_since, connected, is_video
 from vfr_bake.data.quality.sharpness import blurred
 from vfr_bake.data.store.reading import PictureReader
 from vfr_bake.data.store.working import WorkingSize
@@ -275,19 +275,9 @@ def _figures(pictures: Sequence[CheckedPicture], shared: dict[tuple[int, int], S
 def _largest_group(shared: dict[tuple[int, int], Shared]) -> float:
     """Return the share of the compared pictures that are in the largest group that is connected by shared
     features."""
-    leader: dict[int, int] = {}
-
-    def lead(i: int) -> int:
-        while leader.setdefault(i, i) != i:
-            i = leader[i]
-        return i
-
-    for (i, j), number in shared.items():
-        a, b = lead(i), lead(j)
-        if number.n_features >= MIN_SHARED:
-            leader[a] = b
-    groups = Counter(lead(i) for i in list(leader))
-    return max(groups.values()) / len(leader) if leader else 0.0
+    numbers = {number for pair in shared for number in pair}
+    groups = connected(numbers, [pair for pair, both in shared.items() if both.n_features >= MIN_SHARED])
+    return max(map(len, groups)) / len(numbers) if numbers else 0.0
 
 
 def _summary(figures: dict[str, Any]) -> list[str]:

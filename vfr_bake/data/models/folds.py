@@ -58,12 +58,8 @@ def torn_neighbours(model: Any, names: Sequence[str], pairs: Sequence[Pair]) -> 
     return torn
 
 
-def near_pairs(pairs: Sequence[Pair]) -> list[Pair]:
-    """Return the pairs of pictures that (nearly) follow each other."""
-    return [pair for pair in pairs if _is_near(pair)]
-
-
-def _is_near(pair: Pair) -> bool:
+def is_near(pair: Pair) -> bool:
+    """Return whether the pictures of a pair (nearly) follow each other."""
     return pair.j - pair.i <= N_NEIGHBOURS
 
 
@@ -79,7 +75,7 @@ def agreeing_pairs(
     images: dict[str, Any] = {image.name: image for image in walk.images.values() if image.has_pose}
 
     def agrees(pair: Pair) -> bool:
-        if _is_near(pair):
+        if is_near(pair):
             return True
         if names[pair.i] not in images or names[pair.j] not in images:
             return False
