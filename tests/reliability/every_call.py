@@ -86,7 +86,7 @@ def commands(work: Path, names: list[str]) -> list[Command]:
     def export(name: str, target: str, *options: str, more: tuple[str, ...] = (), **settings: Any) -> Command:
         names = dict.fromkeys((target, *more))
         arguments = [str(asset), f"OUT/{target}", *options]
-        changed = settings.pop("old", ["--faces", "60"])
+        changed = settings.pop("old", ["--faces", "20"])
         return Command(name, export_main, arguments, changed, names, **settings)
 
     every = [

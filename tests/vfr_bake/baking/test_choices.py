@@ -58,11 +58,14 @@ def test_each_scene_keeps_to_its_budget(chosen: dict[str, dict]) -> None:
     assert all(sum(report["bytes"].values()) / 1e6 <= MAX_MB for report in chosen.values())
 
 
-def test_fog_takes_more_lookups_than_a_surface(chosen: dict[str, dict]) -> None:
+def test_fog_takes_more_lookups_and_gloss_more_channels_than_a_surface(chosen: dict[str, dict]) -> None:
+    """With two lookups fog loses about a decibel, a surface less than a tenth. How many lookups a surface
+    takes depends on the last hundredths of a decibel, which differ with processor and number of threads."""
     lookups = {kind: report["manifest"].n_fetches for kind, report in chosen.items()}
+    lost = {kind: report["lookups"]["2"] for kind, report in chosen.items()}
     channels = {kind: report["manifest"].n_channels for kind, report in chosen.items()}
-    assert lookups["fog"] > lookups["matte"]
-    assert len(set(zip(lookups.values(), channels.values(), strict=True))) == 3
+    assert lookups["fog"] >= lookups["matte"] and lost["fog"] > 4 * max(lost["matte"], 0.1)
+    assert channels["glossy"] > channels["matte"] > channels["fog"]
 
 
 @pytest.mark.parametrize(("n_specks", "k"), [(1, 2), (3, 8)])
