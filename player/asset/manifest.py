@@ -18,7 +18,7 @@ An asset is a folder of regular files. It holds no absolute path and plays where
 | `generator` | text | the program that wrote the asset |
 | `resolution` | integer, 1..2048 | cells per axis of the densities' finest level |
 | `feature_resolution` | integer, 1..2048 | cells per axis of the features' finest level |
-| `aabb` | 2 x 3 numbers | box, model frame; within 1000 times its shortest edge around the origin |
+| `aabb` | 2 x 3 numbers | box, model frame; no farther from the origin than 1000 of its edges |
 | `world_from_model` | 4 x 4 numbers | similarity: rotation, one positive scale, translation |
 | `contracted` | true or false | whether the box is all of space, contracted (`player.march.contraction`) |
 | `near` | number, 0..1e6 | distance at which rays begin, model units; 0 unless contracted |
@@ -81,8 +81,8 @@ MAX_DEPTH = 64
 MAX_RESOLUTION = 2048
 MAX_STEPS = 65536
 MAX_EDGES = 1000
-"""The largest coordinate of a box, in its shortest edges: farther away, float32 is too coarse for its
-cells."""
+"""The largest coordinate of a box along an axis, in edges along this axis: farther away, float32 is too
+coarse for its cells."""
 MAX_LEVEL_STEP = 128
 AGREEMENT = {False: (20.0, 40.0), True: (14.0, 28.0)}
 """Default of `agreement` where the key is absent, by `contracted`."""
@@ -435,9 +435,9 @@ def _check_together(manifest: Manifest) -> None:
     low, high = manifest.aabb
     if not all(a < b for a, b in zip(low, high, strict=True)):
         raise FormatError(f"manifest: aabb: expected lower corner below upper, got {manifest.aabb}")
-    if max(map(abs, low + high)) > MAX_EDGES * min(b - a for a, b in zip(low, high, strict=True)):
+    if any(max(-a, b) > MAX_EDGES * (b - a) for a, b in zip(low, high, strict=True)):
         raise FormatError(
-            f"manifest: aabb: expected coordinates up to {MAX_EDGES} times its shortest edge, "
+            f"manifest: aabb: expected coordinates up to {MAX_EDGES} times the edge along their axis, "
             f"got {manifest.aabb}"
         )
     if not manifest.density_range[0] < manifest.density_range[1]:

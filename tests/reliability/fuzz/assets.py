@@ -239,7 +239,7 @@ def other_settings(document: dict[str, Any], random: np.random.Generator) -> dic
         "step": (1e-3, 0.01, 0.5, 3.0, 1e9),
         ("n_samples" if document["version"][0] == 3 else "n_fetches"): (0, 1, 2, 64, 1024),
         "density_range": ((-80, 80), (79, 80), (-80, -79), (0, 1e-30)),
-        "aabb": (((-1e9,) * 3, (1e9,) * 3), ((0, 0, 0), (1e-3, 1, 1)), ((-1, -1, -1), (1, 1, 1e-3))),
+        "aabb": (((-1e9,) * 3, (1e9,) * 3), ((0, 0, 0), (1e-9, 1, 1)), ((-1, -1, -1), (1, 1, 1e-3))),
         "background": ((0, 0, 0),),
         "view_size": ((1, 1), (1 << 20, 1)),
         "world_from_model": tuple(
