@@ -1,8 +1,11 @@
-"""The Pareto front: the settings that no other setting beats in quality, time and size at once.
+"""The Pareto front: the settings that no other setting of the front beats in quality, time and size at once.
 
 Quality is in dB, time in ms per frame, size in MB. Times are known only to within their uncertainty, and
 noise must not exclude a setting. So A beats B if A is at least as good, at least as small and not slower
 beyond the uncertainty of both, and if it is better, smaller or faster (beyond the uncertainty) in something.
+
+If A beats B and B beats C, C may still be faster than A beyond the uncertainty. B is then no reason to leave
+out C. So settings join the front from the best quality down, and only those of the front exclude others.
 """
 
 from __future__ import annotations
@@ -41,8 +44,16 @@ def beats(a: Point, b: Point) -> bool:
 
 
 def pareto_front(points: Sequence[Point]) -> list[bool]:
-    """Return for each of the points whether it is on the front."""
-    return [not any(beats(other, point) for other in points) for point in points]
+    """Return for each of the points whether it is on the front.
+
+    >>> pareto_front([Point("a", 34.0, 100, 15, 5), Point("b", 33.9, 85, 15, 5), Point("c", 33.8, 60, 15, 5)])
+    [True, False, True]
+    """
+    front: list[Point] = []
+    for point in sorted(points, key=lambda p: (-p.psnr, p.megabytes, p.ms)):  # none beats one before it
+        if not any(beats(other, point) for other in front):
+            front.append(point)
+    return [point in front for point in points]
 
 
 def recommend(points: Sequence[Point], reference: float, against: str) -> str:
