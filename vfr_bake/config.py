@@ -335,7 +335,7 @@ class BakeConfig:
     The player can be asked for another number."""
     weight_floor: float | None = None
     """A cell is stored if some view gives one of its samples at least this weight. Not given: the highest of
-    a few that loses next to nothing on what is kept apart, or none; 0.01 for an unbounded scene."""
+    a few that loses next to nothing on training pixels, or none; 0.01 for an unbounded scene."""
     no_cull: bool = False
     """Store what no view sees as well: every cell that the model holds matter in."""
     code_levels: int | None = None

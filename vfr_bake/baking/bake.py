@@ -1,8 +1,9 @@
 """The bake, step by step: find the visible cells, choose the values to store, train the head, make the mesh,
 and measure the loss of each step.
 
-All losses are measured on pixels of photographs and on views that nothing else uses
-(`vfr_bake.baking.held_out`). The final result is measured by playing the written files.
+The loss of each step is measured on pixels of photographs that training has not learned from, and on views
+between the training cameras. What may be left out cell by cell, brick by brick and code by code is decided on
+training pixels (`vfr_bake.baking.held_out`). The final result is measured by playing the written files.
 """
 
 from __future__ import annotations

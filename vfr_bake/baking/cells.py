@@ -3,7 +3,7 @@
 In an object's box, the cells that matter to the pictures are stored. The weight of a single sample says
 little about that: in a fog every sample of a ray weighs next to nothing, but their sum is the picture. So
 cells whose samples weigh less than a floor in every view are left out only if the pictures without them lose
-next to nothing, measured on pixels that nothing is trained on.
+next to nothing, measured on training pixels.
 
 An unbounded scene has no occupancy grid, and the field holds untrained values where no view has ever put a
 sample. So a cell is stored only if samples that the model's sampler chose on some ray have weight in it.

@@ -2,8 +2,7 @@
 
 After refinement, cells that hardly any ray sees are left out (`vfr_bake.baking.detail.seen`). Then, places
 where a coarser level will do are shown by that level, first for the densities, then for the features
-(`vfr_bake.baking.detail.shown`). How far each of these steps goes is decided by the loss on held-out pixels
-of photographs.
+(`vfr_bake.baking.detail.shown`). How far each of these steps goes is decided by the loss on training pixels.
 """
 
 from __future__ import annotations

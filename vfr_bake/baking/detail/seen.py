@@ -3,8 +3,7 @@
 At first, a cell is stored if one sample in it weighs enough in one view (`vfr_bake.baking.cells`). That says
 little: unseen space holds whatever training left there, and a single ray of thousands may touch it. Here, the
 weights of all samples are summed over the rays of many views, in blocks of 2 x 2 x 2 cells. The blocks that
-weigh least are left out, as many as can be without losing more than next to nothing on held-out pixels of
-photographs.
+weigh least are left out, as many as can be without losing more than next to nothing on training pixels.
 
 Let W_b be the sum in block b. To give up a share q of the weight, leave out the blocks of lowest W_b, as many
 as have sum_b W_b <= q sum W.
