@@ -55,7 +55,7 @@ mat4 weights(int k) {
 }
 
 vec4 unpackedPair(uint low, uint high) {
-  return vec4(unpackSnorm2x16(low), unpackSnorm2x16(high)) * 128.0;
+  return vec4(unpackSnorm2x16(low), unpackSnorm2x16(high));
 }
 
 void runLayer(vec4 sizes, vec4 after, bool add) {
@@ -84,6 +84,7 @@ void main() {
   for (int p = 0; p < 4; p++) {
     ivec2 at = first + ivec2(p & 1, p >> 1);
     vec3 direction = directionOf(vec2(at) + 0.5);
+    float scale = 128.0 * uintBitsToFloat(texelFetch(uOpacity, at, 0).x); // undoes the shares of pixel.glsl
     READ_FEATURES
     WRITE_MONOMIALS
   }

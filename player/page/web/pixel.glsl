@@ -1,5 +1,6 @@
 // Draws a layer of a pixel: marches its ray and writes what the layer shows. For the colour it writes what the head needs,
-// two features a word. FOUND_OUTPUTS, CLEAR_FEATURES and WRITE_FOUND are replaced by code that program.js writes.
+// two features a word, as shares of the most that they can be at the pixel's opacity. FOUND_OUTPUTS, CLEAR_FEATURES and
+// WRITE_FOUND are replaced by code that program.js writes.
 
 uniform vec3 uOrigin;
 uniform float uStart, uScale;
@@ -40,6 +41,7 @@ void main() {
   CLEAR_FEATURES
   if (hit) fetchFeatures(opacity);
 #ifndef COUNTING
+  float share = 1.0 / (128.0 * max(opacity, MIN_OPACITY));
   WRITE_FOUND
   foundOpacity = uvec4(floatBitsToUint(opacity), hit ? 1u : 0u, 0u, 0u);
 #endif

@@ -17,7 +17,7 @@ function featureTexts(nChannels) {
   const n = featureWords(nChannels), numbers = Array.from({ length: n }, (_, i) => i);
   const nWords = 2 * n, nOut = foundTextures(nChannels);
   const outputs = Array.from({ length: nOut }, (_, i) => `layout(location = ${i}) out uvec4 found${i};\n`);
-  const word = (i) => (i < nWords ? `packSnorm2x16(f${i >> 1}.${i & 1 ? "zw" : "xy"} / 128.0)` : "0u");
+  const word = (i) => (i < nWords ? `packSnorm2x16(f${i >> 1}.${i & 1 ? "zw" : "xy"} * share)` : "0u");
   const write = Array.from({ length: nOut }, (_, i) => `found${i} = uvec4(${[0, 1, 2, 3].map((c) => word(4 * i + c)).join(", ")});`);
   return {
     FEATURES: `vec4 ${numbers.map((i) => `f${i}`).join(", ")};`,
@@ -27,7 +27,7 @@ function featureTexts(nChannels) {
     WRITE_FOUND: write.join("\n"),
     FOUND_INPUTS: Array.from({ length: nOut }, (_, i) => `uniform highp usampler2D uFound${i};`).join("\n"),
     READ_FEATURES: Array.from({ length: nOut }, (_, i) => {
-      const put = (j, pair) => (j < n ? [`memory[FEATURES_AT + ${j}][p] = unpackedPair(${pair});`] : []);
+      const put = (j, pair) => (j < n ? [`memory[FEATURES_AT + ${j}][p] = unpackedPair(${pair}) * scale;`] : []);
       return [`uvec4 u${i} = texelFetch(uFound${i}, at, 0);`, ...put(2 * i, `u${i}.x, u${i}.y`), ...put(2 * i + 1, `u${i}.z, u${i}.w`)].join("\n");
     }).join("\n"),
   };

@@ -14,9 +14,11 @@ import pytest
 from playwright.sync_api import Browser
 from scipy import ndimage
 
+from player.app.option_types import DEMO
 from player.asset.asset import Asset
 from player.asset.grid import DISTANCE_BITS, MAX_DISTANCE, SparseGrid
 from player.cameras.camera import Camera
+from player.cameras.views import asset_cameras
 from player.page.gpu_memory import gpu_bytes
 from player.render import Renderer
 from player.viewer.layers import coloured
@@ -114,6 +116,17 @@ def test_any_number_of_fetches(scene: Scene, n_fetches: int) -> None:
 @pytest.mark.parametrize("background", ["transparent", (0.0, 1.0, 0.25)], ids=str)
 def test_any_background(scene: Scene, background: Any) -> None:
     scene.check(scene.cameras["outside"], None, background)
+
+
+def test_thin_edges_before_a_transparent_background(chromium: Browser, tmp_path: Path) -> None:
+    """The straight colours of thin rays, which a picture before a background hardly shows, are the
+    player's."""
+    asset = Asset.open(DEMO)
+    demo = Scene(asset, RenderPage(chromium, asset, tmp_path / "demo.html"))
+    for view in (3, 12, 40):
+        demo.check(asset_cameras(asset)[view].resized(160, 160), None, "transparent")
+    demo.player.close()
+    demo.page.close()
 
 
 def test_layers_are_the_players(scene: Scene) -> None:
