@@ -188,14 +188,10 @@ class Renderer:
         """
         if self._closed:
             raise ConfigError("renderer: expected an open one, got one that was closed: make another")
-        k = self.asset.manifest.n_fetches if n_fetches is None else n_fetches
-        k = checked_samples(k)
         check_size(camera.width, camera.height)
         background = checked_background(self.asset.manifest.background if background is None else background)
-        check_choice("quality", quality, get_args(Quality))
-        reduced = self._reduced(quality)
-        k = min((n for n in (k, reduced.n_fetches) if n), default=0)
-        k = min(k, self._grid.most_samples)
+        k = fetches_used(self.asset, n_fetches, quality)
+        reduced = _reduced(self.asset, quality)
         picture = self._blank(camera, background, k, reduced.opaque_depth, layers)
         for stage in stages(reduced.levels, picture.view.grid.contracted):
             self._in_tasks(picture, stage)
@@ -214,14 +210,6 @@ class Renderer:
         if normals is not None:
             vars(frame)["normals"] = normals  # already known
         return frame
-
-    def _reduced(self, quality: Quality) -> _Reduced:
-        """Return the reductions of a quality, as far as the asset allows them."""
-        levels, n_fetches, manifest = 0.0, 0, self.asset.manifest
-        if quality != "exact":
-            number = ("high", "fast").index(quality)
-            levels, n_fetches = manifest.agreement[number], (manifest.quality_fetches or (0, 0))[number]
-        return _Reduced(levels, n_fetches, OPAQUE_DEPTH[quality if levels or n_fetches else "exact"])
 
     def _blank(
         self,
@@ -326,6 +314,26 @@ class _Picture(NamedTuple):
     """The optical depth at which rays stop."""
     features: np.ndarray | None
     """[n, n_channels] float32, the input of the head for each pixel; None if it is not wanted."""
+
+
+def fetches_used(asset: Asset, n_fetches: int | None = None, quality: Quality = "exact") -> int:
+    """Return the most feature lookups of a ray in pictures of a quality; 0: one at every sample.
+
+    `n_fetches`: as in `render`. Raises ConfigError if it or `quality` is out of range.
+    """
+    check_choice("quality", quality, get_args(Quality))
+    k = checked_samples(asset.manifest.n_fetches if n_fetches is None else n_fetches)
+    k = min((n for n in (k, _reduced(asset, quality).n_fetches) if n), default=0)
+    return min(k, asset.most_samples)
+
+
+def _reduced(asset: Asset, quality: Quality) -> _Reduced:
+    """Return the reductions of a quality, as far as the asset allows them."""
+    levels, n_fetches, manifest = 0.0, 0, asset.manifest
+    if quality != "exact":
+        number = ("high", "fast").index(quality)
+        levels, n_fetches = manifest.agreement[number], (manifest.quality_fetches or (0, 0))[number]
+    return _Reduced(levels, n_fetches, OPAQUE_DEPTH[quality if levels or n_fetches else "exact"])
 
 
 def check_size(width: int, height: int) -> None:

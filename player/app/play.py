@@ -21,7 +21,7 @@ from player.cameras.camera import Camera
 from player.errors import ConfigError
 from player.files.files import write_bytes
 from player.files.images import MOST_WEBP_SIDE
-from player.render import FRAME_BYTES, MAX_PIXELS, Renderer, check_size
+from player.render import FRAME_BYTES, MAX_PIXELS, Renderer, check_size, fetches_used
 
 LARGE_BYTES = 1e9
 """A line warns before a picture is rendered, or a video, that takes this many bytes of memory or more."""
@@ -179,7 +179,7 @@ def _figures(asset: Asset, camera: Camera, done: list[Done], settings: PlaySetti
         "threads": done[0].threads if done else None,
         "march": done[0].march if done else None,
         "peak_rss_mb": peak_rss_mb(),
-        "n_fetches": asset.manifest.n_fetches if settings.samples is None else settings.samples,
+        "n_fetches": fetches_used(asset, settings.samples, settings.quality),
         "quality": settings.quality,
     }
 
