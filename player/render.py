@@ -440,6 +440,7 @@ def render(
     background: Background | Colour | None = None,
     n_threads: int | None = None,
     march: March = "auto",
+    quality: Quality = "exact",
 ) -> Frame:
     """Render one picture of an asset; the threads and the open head are kept for the next call.
 
@@ -451,6 +452,7 @@ def render(
         n_threads: number of threads; one for each core if None.
         march: "numba", "numpy", or "auto": numba where it is installed and was not found to be wrong
             (`player.proof`).
+        quality: "exact", or "high" or "fast" as in `Renderer.render`.
 
     Returns:
         The frame: `rgb` [h, w, 3], `opacity` [h, w], `depth` [h, w] in world units, `normals` [h, w, 3].
@@ -467,4 +469,4 @@ def render(
     >>> frame.rgb.shape, frame.opacity.shape, frame.depth.shape, frame.normals.shape
     ((40, 48, 3), (40, 48), (40, 48), (40, 48, 3))
     """
-    return _renderer(asset, n_threads, march).render(camera, n_fetches, background)
+    return _renderer(asset, n_threads, march).render(camera, n_fetches, background, quality=quality)

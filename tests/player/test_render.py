@@ -24,6 +24,7 @@ from player.files.images import png_bytes
 from player.head.head import CHUNK, Head
 from player.march import pixels
 from player.march.bounds import BLOCK, block_bounds
+from player.march.interpolation import Quality
 from player.march.march import MarchResult, march
 from player.render import FRAME_BYTES, MAX_PIXELS, Renderer, render
 from tests.numerics.bounds import Row
@@ -194,6 +195,14 @@ def test_default_background_and_k_are_the_assets_own(asset: Asset, camera: Camer
     assert a.rgb.tobytes() == b.rgb.tobytes()
     every = render(asset, camera, n_fetches=0)
     assert every.opacity.tobytes() == a.opacity.tobytes() and every.rgb.tobytes() != a.rgb.tobytes()
+
+
+@pytest.mark.parametrize("quality", ["high", "fast"])
+def test_one_picture_is_rendered_in_a_quality(quality: Quality, asset: Asset, camera: Camera) -> None:
+    with Renderer(asset) as renderer:
+        wanted = renderer.render(camera, quality=quality)
+    got = render(asset, camera, quality=quality)
+    assert got.rgb.tobytes() == wanted.rgb.tobytes() != render(asset, camera).rgb.tobytes()
 
 
 def test_rounding_to_eight_bits() -> None:
