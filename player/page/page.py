@@ -66,7 +66,7 @@ addEventListener("error", ({ target }) => {
 }, true);
 """
 MAX_GPU_MB = 512
-"""Megabytes of graphics memory that a page may take, unless more are allowed."""
+"""Megabytes of graphics memory that an exported page may take, unless more are allowed."""
 _POLICY = (
     "default-src 'none'; script-src {script}; style-src {style}; img-src data: blob: {img}; "
     "worker-src {worker}; connect-src {connect}; base-uri 'none'; form-action 'none'"
@@ -87,7 +87,7 @@ class WebPage(NamedTuple):
 def page(
     asset: Asset,
     title: str | None = None,
-    max_gpu_mb: int = MAX_GPU_MB,
+    max_gpu_mb: int | None = None,
     n_threads: int | None = None,
     march: March = "auto",
 ) -> bytes:
@@ -96,7 +96,8 @@ def page(
     Args:
         asset: an open asset, all of its parts.
         title: the page's title; the name of the asset's folder if None.
-        max_gpu_mb: megabytes of graphics memory that the page may take.
+        max_gpu_mb: megabytes of graphics memory that the page may take; any number if None. Each page finds
+            out by itself whether the visitor's device has enough.
         n_threads, march: those of `player.render.render`, for the picture that the page shows at first.
 
     Raises:
@@ -114,7 +115,7 @@ def page(
 def page_of_one_file(
     asset: Asset,
     title: str | None = None,
-    max_gpu_mb: int = MAX_GPU_MB,
+    max_gpu_mb: int | None = None,
     n_threads: int | None = None,
     march: March = "auto",
 ) -> WebPage:
@@ -146,7 +147,7 @@ def page_of_one_file(
     return WebPage({INDEX: content}, len(before) + len(behind) - len(poster), n_gpu)
 
 
-def page_of_many_files(asset: Asset, title: str | None = None, max_gpu_mb: int = MAX_GPU_MB) -> WebPage:
+def page_of_many_files(asset: Asset, title: str | None = None, max_gpu_mb: int | None = None) -> WebPage:
     """Make the files of a folder for a web server. Its page, `index.html`, shows the scene as soon as the
     first part is loaded. `title`, `max_gpu_mb` and the errors are those of `page`.
 
@@ -195,7 +196,7 @@ def is_site_file(name: str) -> bool:
     return name in web_files() or name == POSTER or re.fullmatch(data, name) is not None
 
 
-def _checked_gpu_bytes(asset: Asset, max_gpu_mb: int) -> int:
+def _checked_gpu_bytes(asset: Asset, max_gpu_mb: int | None) -> int:
     n_channels = asset.manifest.n_channels
     if n_channels > MOST_CHANNELS:
         raise ConfigError(
@@ -209,7 +210,7 @@ def _checked_gpu_bytes(asset: Asset, max_gpu_mb: int) -> int:
             f"MB, which browsers give a page, got {needed / 1e6:.0f} MB: bake it smaller (vfr-bake --preset)"
         )
     found = gpu_bytes(asset)
-    if found > max_gpu_mb * 1_000_000:
+    if max_gpu_mb is not None and found > max_gpu_mb * 1_000_000:
         raise ConfigError(
             f"{asset.folder}: graphics memory: expected at most {max_gpu_mb} MB, got "
             f"{found / 1e6:.0f} MB: bake it smaller (vfr-bake --preset), or allow more (--max-gpu-mb)"
