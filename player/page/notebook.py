@@ -30,7 +30,7 @@ def inline(asset: Asset, height: int = 480) -> Inline:
     """Make the page of an asset, which a notebook shows below a cell whose last value it is.
 
     Args:
-        asset: an open asset, all of its parts.
+        asset: an open asset. The page shows the parts with which it was opened.
         height: of the frame, pixels.
 
     Raises:

@@ -94,7 +94,7 @@ def page(
     """Make one HTML file, in ASCII, which loads nothing else.
 
     Args:
-        asset: an open asset, all of its parts.
+        asset: an open asset. The page shows the parts with which it was opened.
         title: the page's title; the name of the asset's folder if None.
         max_gpu_mb: megabytes of graphics memory that the page may take; any number if None. Each page finds
             out by itself whether the visitor's device has enough.
@@ -102,7 +102,7 @@ def page(
 
     Raises:
         ConfigError: the page takes more graphics memory, or more memory than browsers give a page, or the
-            asset has more channels than browsers can draw, or was opened without some of its parts.
+            asset has more channels than browsers can draw.
         FormatError: a file of the asset is broken, or a part is missing.
         MissingExtraError: `march` is "numba", which is not installed or does not run here.
 

@@ -5,7 +5,7 @@
 | `manifest.json` | the asset's manifest as version 4.0, without provenance, and with these `files` |
 | `cameras.json` | for each camera its name, width, height, fx, fy, cx, cy and c2w (16 numbers by rows) |
 | `head.json`, `head.bin` | the head (`player.page.head_data`) |
-| `part_0.bin`, ... | the asset's own parts |
+| `part_0.bin`, ... | those of the asset's own parts with which it was opened |
 
 The densities and features of an asset of version 3 are written as the parts of a pyramid of one level, which
 holds the same values.
@@ -20,7 +20,7 @@ from player.asset.arranging import write_parts
 from player.asset.asset import Asset
 from player.asset.manifest import NAME, VERSION, file_entry, manifest_bytes
 from player.cameras.views import asset_cameras
-from player.errors import ConfigError, FormatError
+from player.errors import FormatError
 from player.head.head import asset_head
 from player.page.head_data import head_data
 
@@ -30,8 +30,7 @@ MANIFEST = NAME
 def scene_files(asset: Asset) -> dict[str, bytes]:
     """Make the data of a page, in the order in which its files are asked for.
 
-    Raises FormatError: a file of the asset is broken, or a part is missing; ConfigError: the asset was opened
-    without some of its parts.
+    Raises FormatError: a file of the asset is broken, or a part is missing.
 
     >>> list(scene_files(Asset.open("out/")))
     ['manifest.json', 'cameras.json', 'head.json', 'head.bin', 'part_0.bin']
@@ -39,14 +38,10 @@ def scene_files(asset: Asset) -> dict[str, bytes]:
     if asset.missing is not None:
         raise FormatError(asset.missing)
     manifest = asset.manifest
-    if asset.n_parts < len(manifest.parts):
-        raise ConfigError(
-            f"{asset.folder}: parts: expected an asset that was opened with all of its "
-            f"{len(manifest.parts)}, got {asset.n_parts}"
-        )
     head = head_data(asset_head(asset))
     files = {"cameras.json": _cameras(asset), "head.json": head.description, "head.bin": head.numbers}
     if manifest.parts:
+        manifest = replace(manifest, parts=manifest.parts[: asset.n_parts])
         files |= {part.file: asset.read(part.file) for part in manifest.parts}
     else:
         stored = asset.arrays

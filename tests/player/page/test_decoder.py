@@ -13,19 +13,22 @@ import numpy as np
 import pytest
 from playwright.sync_api import Browser
 
+from player.app.option_types import DEMO
 from player.asset.asset import Asset, GridArrays, write_asset
 from player.asset.pyramid import Bricks, Pyramid, PyramidValues
 from player.asset.version_3.unpacking import read_arrays
 from player.cameras.views import asset_cameras
-from player.errors import ConfigError, FormatError
+from player.errors import FormatError
 from player.head.head import asset_head
 from player.page import page
-from player.page.gpu_memory import MOST_DECODING_BYTES, decoding_bytes
+from player.page.gpu_memory import MOST_DECODING_BYTES, decoding_bytes, gpu_bytes
 from player.page.scene_files import scene_files
+from player.render import render
 from tests.player.asset.test_asset import replace_file
 from tests.player.asset.test_parts import MANIFEST, STEPS, cells, stored
 from tests.player.conftest import cameras_bytes, head_bytes
 from tests.player.page.decoder_page import decoded, decoder_page, expected, without_problem
+from tests.player.page.render_page import RenderPage
 from tests.version_3 import pack_codes, pack_masks
 
 OLD = Path(__file__).parents[1] / "asset" / "version_3_1" / "asset"
@@ -72,11 +75,30 @@ def test_levels_are_decoded(chromium: Browser, levels: Asset, tmp_path: Path) ->
     check(chromium, tmp_path, levels)
 
 
-def test_fewer_parts_than_there_are_are_refused(levels: Asset) -> None:
-    with pytest.raises(
-        ConfigError, match=r"parts: expected an asset that was opened with all of its \d, got 2"
-    ):
-        page(Asset.open(levels.folder, parts=2))
+def test_a_page_has_the_parts_with_which_its_asset_was_opened(
+    chromium: Browser, levels: Asset, tmp_path: Path
+) -> None:
+    for n_parts in (1, 2):
+        files = scene_files(Asset.open(levels.folder, parts=n_parts))
+        assert [name for name in files if name.startswith("part_")] == [
+            f"part_{i}.bin" for i in range(n_parts)
+        ]
+        last = run(chromium, tmp_path, files)["scenes"][-1]
+        assert last["problem"] is None and last["n_parts"] == n_parts
+        assert without_problem(last) == expected(Asset.open(levels.folder, parts=n_parts))
+
+
+def test_a_page_of_the_first_part_plays(chromium: Browser, tmp_path: Path) -> None:
+    """What is drawn of an asset's first part, and the memory that it takes, are the player's."""
+    asset = Asset.open(DEMO, parts=1)
+    camera = asset_cameras(asset)[12].resized(60, 60)
+    drawn = RenderPage(chromium, asset, tmp_path / "scene.html")
+    picture = drawn.picture(camera, quality="exact")[..., :3].astype(int)
+    assert (
+        np.abs(picture - render(asset, camera, march="numpy").to_uint8()).max(axis=-1) <= 3
+    ).mean() > 0.999
+    assert drawn.page.evaluate("() => vfr.info.gpuBytes") == gpu_bytes(asset)
+    drawn.close()
 
 
 def test_one_level_is_decoded(chromium: Browser, asset: Asset, tmp_path: Path) -> None:
