@@ -12,8 +12,7 @@ const MOST_BYTES = 3200e6;
 // and a symbol that has not been read is 0. Values are computed from symbols when they are asked for, all channels of a
 // level at once.
 class PyramidReader {
-  // `structures`: the structure sections of this pyramid in all parts.
-  constructor(grid, manifest, structures) {
+  constructor(grid, manifest) {
     const isFeatures = grid === "features";
     this.steps = isFeatures ? manifest.feature_steps : manifest.density_steps;
     this.nChannels = isFeatures ? manifest.n_channels : 1;
@@ -26,12 +25,10 @@ class PyramidReader {
     this.beyond = this.steps.map(() => []); // for those of these channels that were read, { bytes, first }: see putValues
     this.rows = null; // rows of the level whose symbols were read last
     this.rowsLevel = -1;
-    // The first row of each level, the finest level first. `values` leaves out the rows of the finest levels while they are
-    // not known.
-    const nRows = this.steps.map((_, level) => structures.find((s) => s.level === level)?.n_vertices ?? 0);
-    this.firstRows = [0];
-    for (const n of nRows) this.firstRows.push(this.firstRows.at(-1) + n);
-    this.all = new (isFeatures ? Int8Array : Uint8Array)(this.firstRows.at(-1) * this.stride);
+    // The first row of each level, the finest level first, and the rows of values of all levels that are known so far. They
+    // grow with each level, so that a device whose memory is too small for a finer level keeps what it shows.
+    this.firstRows = new Array(this.steps.length + 1).fill(0);
+    this.all = new (isFeatures ? Int8Array : Uint8Array)(0);
   }
 
   valuesOf(level) {
@@ -47,6 +44,10 @@ class PyramidReader {
     if (found !== section.n_vertices) {
       throw new Error(`${where}: n_vertices: expected ${found}, got ${section.n_vertices}`);
     }
+    const coarserValues = this.all, nNew = found * this.stride;
+    this.all = new coarserValues.constructor(nNew + coarserValues.length);
+    this.all.set(coarserValues, nNew);
+    this.firstRows = this.firstRows.map((row, other) => (other > section.level ? row + found : row));
   }
 
   async readSymbols(section, data, where, pause) {
@@ -95,16 +96,13 @@ class PyramidReader {
   values(isLast) {
     const { pyramid, nChannels, stride } = this;
     for (let level = this.steps.length - 1; level >= 0; level--) this.put(level);
-    const finest = Math.max(0, pyramid.levels.findIndex((bricks) => bricks.n > 0));
-    const first = this.firstRows[finest];
-    const known = this.all.subarray(first * stride);
     return {
       n_channels: nChannels,
       stride,
       levels: pyramid.levels,
       vertices: pyramid.vertices,
-      values: isLast && first === 0 ? this.all : known.slice(),
-      firstRows: this.firstRows.map((row) => Math.max(0, row - first)),
+      values: isLast ? this.all : this.all.slice(),
+      firstRows: this.firstRows,
     };
   }
 }
@@ -121,9 +119,7 @@ export class PartsReader {
       throw new Error(`the scene takes ${Math.ceil(nBytes / 1e6)} MB of memory: expected at most 3200 MB`);
     }
     this.grids = {};
-    for (const grid of grids) {
-      this.grids[grid] = new PyramidReader(grid, manifest, structures.filter((s) => s.grid === grid));
-    }
+    for (const grid of grids) this.grids[grid] = new PyramidReader(grid, manifest);
     this.nRead = 0;
   }
 

@@ -250,6 +250,35 @@ def test_parts_before_a_broken_one_are_shown(chromium: Browser, levels: Asset, t
     assert last["problem"].startswith("part_2.bin: ") and last["n_parts"] == 1
 
 
+REFUSES = """
+const Own = Int8Array;
+globalThis.Int8Array = class Int8Array extends Own {
+  constructor(...given) {
+    if (given[0] >= MOST) throw RangeError("Array buffer allocation failed");
+    super(...given);
+  }
+};
+"""
+
+
+@pytest.mark.parametrize("worker", ["", "globalThis.Worker = undefined;\n"], ids=["worker", "no worker"])
+def test_parts_before_one_that_does_not_fit_into_memory_are_shown(
+    chromium: Browser, levels: Asset, tmp_path: Path, worker: str
+) -> None:
+    """A device that refuses memory for the features of all levels shows those of the coarser ones."""
+    n_parts = len(levels.manifest.parts)
+    rows = [Asset.open(levels.folder, parts=n).arrays.features.first_rows[-1] for n in range(1, n_parts + 1)]
+    n_before = int(np.searchsorted(rows, rows[-1]))
+    assert 0 < n_before
+    before = REFUSES.replace("MOST", str(12 * rows[-1])) + worker
+    found = run(chromium, tmp_path, scene_files(levels), before)
+    last = found["scenes"][-1]
+    assert found["error"] is None
+    wanted = f"Array buffer allocation failed: shown as the first {n_before} of {n_parts} parts have it"
+    assert last["problem"] == wanted
+    assert last["n_parts"] == 1 and without_problem(last) == expected(Asset.open(levels.folder, parts=1))
+
+
 def with_last_section_apart(folder: Path, to: Path) -> Path:
     """Copy an asset so that its last section, symbols of a level whose structure is in an earlier part, is a
     part of its own; return the new folder."""
