@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -99,19 +100,22 @@ def main() -> None:
     n_samples, last = 0, None
     reports = trainer.run()
     n_trained = max(1, trainer.pace.steps - options.profiled_steps)
+    begin = time.monotonic()
     for last in reports:
         n_samples += last.n_samples
         if sys.stderr.isatty() and last.step % 50 == 0:
             print(f"\r{last.progress:.0%}, loss {last.loss:.5f}", end="", file=sys.stderr)
         if last.step + 1 >= n_trained:
             break
+    torch.cuda.synchronize()
+    seconds = time.monotonic() - begin
     assert last is not None
     parts = profile_steps(trainer, reports, options.profiled_steps)
     figures = {
         "device": torch.cuda.get_device_name(),
-        "minutes": last.seconds / 60,
+        "minutes": seconds / 60,
         "steps": last.step + 1,
-        "samples_per_second": n_samples / last.seconds,
+        "samples_per_second": n_samples / seconds,
         "gigabytes": torch.cuda.max_memory_allocated() / 1e9,
     }
     model, n_views = trained_model(trainer, scene, {}), len(scene.test.cameras)
