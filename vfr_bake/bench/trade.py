@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from player.asset.asset import Asset
+from player.asset.manifest import NAME
 from player.cameras.camera import Camera
 from player.cameras.transforms import write_cameras
 from player.cameras.views import asset_cameras
@@ -337,9 +338,11 @@ def describe(asset: Asset) -> dict[str, Any]:
 
 
 def played_bytes(asset: Asset) -> int:
-    """Return the bytes of all files except the reports, which no player reads."""
+    """Return the bytes of the manifest and of all files that it lists, except the reports, which no player
+    reads."""
     files = asset.manifest.files.items()
-    return sum(entry.bytes for name, entry in files if not name.startswith("report."))
+    listed = sum(entry.bytes for name, entry in files if not name.startswith("report."))
+    return listed + (asset.folder / NAME).stat().st_size
 
 
 def _read_views(config: BenchConfig, assets: list[Asset], progress: Report) -> tuple[Views, list[str]]:
