@@ -17,6 +17,7 @@ from player.asset.folder import check_files, check_size, check_sum, file_digest,
 from player.asset.grid import SparseGrid, build_grid, most_samples
 from player.asset.manifest import (
     MAX_BYTES,
+    MESH,
     NAME,
     VERSION,
     FileEntry,
@@ -114,7 +115,7 @@ class Asset:
             verify: first compare the checksum of every file that the manifest lists, which reads every byte,
                 and raise if any part cannot be decoded. If False, a file is compared when it is read: now the
                 parts, later the head and the cameras. A part after the first that is missing, cut short,
-                changed or broken is then no error: `asset.missing` says so.
+                changed or broken is then no error: `asset.missing` says so. The mesh is not looked at.
             max_memory: gigabytes that the asset may take, unpacked and arranged for marching. If None, half
                 of what the machine has.
             parts: number of parts to read, 1 or more: the fewer, the coarser the picture and the sooner it
@@ -230,7 +231,8 @@ class _Opening:
         self.manifest = read_manifest(folder)
         self._folder = folder = folder.absolute()
         files = self.manifest.files
-        needed = files if verify else {name: files[name] for name in needed_files(self.manifest.version)}
+        played = (name for name in needed_files(self.manifest.version) if name != MESH)
+        needed = files if verify else {name: files[name] for name in played}
         check_files(folder, needed, self._allowed)
         if verify:
             for name, entry in needed.items():

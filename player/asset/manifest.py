@@ -7,7 +7,7 @@ An asset is a folder of regular files. It holds no absolute path and plays where
 | `manifest.json` | the keys below; UTF-8, keys sorted, each once; at most 16 MiB, 2^20 values, 64 deep |
 | `part_0.bin`, `part_1.bin`, ... | densities and features; the first is a whole, coarse picture |
 | `head.onnx` | the graph of `player.head.graph`: `features`, `dirs` -> `rgb`; no other graph is taken |
-| `mesh.ply` | the surface with vertex colours, world frame |
+| `mesh.ply` | the surface with vertex colours, world frame; an asset plays without it |
 | `cameras.json` | the training cameras as transforms.json with sizes, world frame |
 | `report.json`, `report.html` | the bake's measurements, for people; no player reads them; may be absent |
 
@@ -60,7 +60,9 @@ from player.errors import FormatError, VersionError
 FORMAT = "vfr-asset"
 VERSION = (4, 0)
 NAME = "manifest.json"
-FILES = ("head.onnx", "mesh.ply", "cameras.json", part_name(0))
+MESH = "mesh.ply"
+"""The mesh, which no player reads."""
+FILES = ("head.onnx", MESH, "cameras.json", part_name(0))
 """The files that every asset of version 4 has."""
 FILES_OF_3 = (
     "brick_coords.npy",
@@ -70,7 +72,7 @@ FILES_OF_3 = (
     "feature_masks.bits",
     "features.codes",
     "head.onnx",
-    "mesh.ply",
+    MESH,
     "cameras.json",
 )
 """The files that every asset of version 3 has."""

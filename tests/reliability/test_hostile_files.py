@@ -17,6 +17,7 @@ REPOSITORY = Path(__file__).resolve().parents[2]
 MESH = "export of the mesh"
 """Command that never succeeds, because the small asset has no valid mesh."""
 READ = {
+    "a terabyte of mesh, vouched for": {"info", "play"},
     "text that a terminal obeys": {"info", "check", "play", "export", "export of the mesh"},
     "text that a terminal obeys, in a message": {"check"},
 }

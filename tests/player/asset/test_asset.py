@@ -69,11 +69,16 @@ def test_what_is_added_at_the_end_is_listed_and_a_failure_there_leaves_nothing(
 
 
 def test_files_that_no_player_reads_may_be_missing(asset: Asset, tmp_path: Path) -> None:
-    """A report is for people; whoever copies an asset may leave it out."""
+    """A report is for people and the mesh for other programs; whoever copies an asset may leave them out."""
     write_asset(tmp_path / "a", *parts(asset), finish=lambda _: {"report.json": b"{}", "notes.txt": b"n"})
     (tmp_path / "a" / "report.json").unlink()
+    (tmp_path / "a" / "mesh.ply").unlink()
     (tmp_path / "a" / "notes.txt").write_text("other notes")
-    assert Asset.open(tmp_path / "a").missing is None
+    opened = Asset.open(tmp_path / "a")
+    assert opened.missing is None
+    with pytest.raises(FormatError, match=r"mesh\.ply: no such file: expected a file of 4 bytes"):
+        opened.read("mesh.ply")
+    (tmp_path / "a" / "mesh.ply").write_bytes(b"ply\n")
     with pytest.raises(IntegrityError, match=r"notes\.txt: size"):
         Asset.open(tmp_path / "a", verify=True)
 
@@ -130,13 +135,14 @@ def test_missing_cut_and_changed_files_are_named(name: str, broken_folder: Path)
     failed = [n for n, error in checksums(broken_folder, read_manifest(broken_folder)) if error]
     assert failed == [name]
     path.write_bytes(data[:-1])
+    unread = name == "mesh.ply"  # nothing but a verification looks at it
     with pytest.raises(
         IntegrityError, match=rf"{name}: size: expected {len(data)} bytes, got {len(data) - 1}"
     ):
-        Asset.open(broken_folder)
+        Asset.open(broken_folder, verify=unread)
     path.unlink()
     with pytest.raises(FormatError, match=rf"{name}: no such file: expected a file of {len(data)} bytes"):
-        Asset.open(broken_folder)
+        Asset.open(broken_folder, verify=unread)
 
 
 @pytest.mark.parametrize("name", ["head.onnx", "cameras.json"])
