@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
 from tests.benchmarks.suite.conditions import QUIET
@@ -104,10 +104,21 @@ def machines(results: Results) -> dict[str, dict[str, Any]]:
 
 
 def where(results: Results, name: str) -> str:
-    """Return machine and commit of a part, with * if other programs took more than counts as quiet."""
+    """Return machine and commit of a part, with * if other programs took more than counts as quiet beside it,
+    or (*) beside a part that it was made from: trainings and bakes then take fewer steps in equal time."""
     part = results[name]
-    beside = "*" if max(part["others"], part["others_before"]) > QUIET else ""
+    busy = [max(some["others"], some["others_before"]) > QUIET for some in _part_and_sources(results, name)]
+    beside = "*" if busy[0] else "(*)" if any(busy) else ""
     return f"{part['letter']}{beside}, {part['commit'][:7]}"
+
+
+def _part_and_sources(results: Results, name: str) -> Iterator[dict[str, Any]]:
+    """Yield a part, and then those of the same machine that its files were made from."""
+    part = results[name]
+    yield part
+    for need in PARTS[name].needs:
+        if need != "compiled" and need in results and results[need]["letter"] == part["letter"]:
+            yield from _part_and_sources(results, need)
 
 
 def measured_on(results: Results, names: Sequence[str]) -> list[str]:

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from tests.benchmarks.suite.results import Results
 from tests.benchmarks.suite.scenes import SCENES
+from vfr_bake.bench.front import Point, pareto_front
 from vfr_bake.bench.plot import Mark, plot
 
 FILE = 'xmlns="http://www.w3.org/2000/svg" font-family="sans-serif" font-size="13" style="background:#fff"'
@@ -15,6 +18,19 @@ def plot_name(scene: str) -> str:
     return f"trade_{scene}.svg"
 
 
+def played_rows(results: Results, name: str) -> list[dict[str, Any]]:
+    """Return the settings of a trade that play an asset, not the full model, with `on_front`: whether they
+    are on the front for frames of the size by which settings are compared."""
+    figures = results[name]["figures"]
+    rows = [row for row in figures["settings"] if row["asset"] is not None]
+    points = []
+    for row in rows:
+        times = row["times"][figures["size"]]
+        megabytes = row["n_bytes"] / 1e6
+        points.append(Point("", row["scores"]["psnr"], times["median"], times["uncertainty"], megabytes))
+    return [row | {"on_front": on} for row, on in zip(rows, pareto_front(points), strict=True)]
+
+
 def plots(results: Results) -> dict[str, str]:
     """Return the plots of the scenes that have results, by the names of their files."""
     names = {scene: f"trade_{scene}" for scene in (*SCENES, "dials")}
@@ -23,9 +39,8 @@ def plots(results: Results) -> dict[str, str]:
 
 def _plot(results: Results, scene: str) -> str:
     """Plot PSNR against frames a second; a mark's area is the asset's share of the largest one's bytes."""
-    figures = results[f"trade_{scene}"]["figures"]
-    size = figures["size"]
-    rows = [row for row in figures["settings"] if row["asset"] is not None]
+    size = results[f"trade_{scene}"]["figures"]["size"]
+    rows = played_rows(results, f"trade_{scene}")
     most = max(row["n_bytes"] for row in rows)
     series: dict[str, list[Mark]] = {}
     for row in rows:

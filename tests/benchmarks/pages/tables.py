@@ -25,7 +25,7 @@ from tests.benchmarks.pages.cells import (
 from tests.benchmarks.suite.parts import LIMITS_MB, MINUTES, PAGES, PRESETS, REFINED_AT, SEEDS, plays
 from tests.benchmarks.suite.played import LOOKUPS
 from tests.benchmarks.suite.results import Results
-from tests.benchmarks.suite.scenes import SCENES
+from tests.benchmarks.suite.scenes import SCENES, uncertainty_of_mean
 
 BAKES = [f"bake_{scene}_{preset}" for scene, presets in PRESETS.items() for preset in presets]
 VERSIONS = ("python", "numpy", "numba", "onnxruntime", "torch")
@@ -158,8 +158,7 @@ def baking(results: Results) -> list[str]:
     rows = []
     for name in there:
         found, played = results[name]["figures"], own_setting(results, name)
-        n_bytes = found["n_bytes"] - found["bytes"]["manifest.json"]
-        if played is not None and played["n_bytes"] != n_bytes:
+        if played is not None and played["n_bytes"] != found["n_bytes"]:
             played = None  # another asset's
         row = [
             asset_name(name),
@@ -244,24 +243,29 @@ def expected_lookups(results: Results) -> list[str]:
 def lookups(results: Results) -> list[str]:
     there, lacking = present(results, ["lookups_lego", "lookups_fox"])
     ks = [k for k in LOOKUPS if k != "0"]
-    rows = [row for name in there for row in _lookup_rows(name, results[name]["figures"], ks)]
-    return [*titled(["scene, refined for", *ks], rows, lacking), *measured_on(results, there)]
+    rows = [row for name in there for row in _lookup_rows(results, name, ks)]
+    titles = ["scene, refined for", "test views", "MB", *ks]
+    return [*titled(titles, rows, lacking), *measured_on(results, there)]
 
 
-def _lookup_rows(name: str, found: dict[str, Any], ks: list[str]) -> list[list[str]]:
-    """Return rows of mean losses over views and seeds, with the views' uncertainty and the seeds' range."""
-    scene = name.partition("_")[2]
+def _lookup_rows(results: Results, name: str, ks: list[str]) -> list[list[str]]:
+    """Return rows with the bytes of the assets and with mean losses over views and seeds, with the views'
+    uncertainty and the seeds' range."""
+    scene, found = name.partition("_")[2], results[name]["figures"]
     rows = []
     every = {seed: np.array(found[f"every, seed {seed}"]["0"]) for seed in SEEDS}
     for refined, asked in REFINED_AT.items():
-        cells = []
+        assets = [f"bake_{scene}_seed{seed}_{refined}" for seed in SEEDS]
+        sizes = [results[asset]["figures"]["n_bytes"] for asset in assets if asset in results]
+        told = f"{megabytes(min(sizes))} to {megabytes(max(sizes))}" if sizes else ""
+        cells = [f"{len(every[SEEDS[0]])}", told]
         for k in ks:
             if asked not in ("0", k):
                 cells.append("")
                 continue
             lost = np.array([every[s] - np.array(found[f"{refined}, seed {s}"][k]) for s in SEEDS])
             views, seeds = lost.mean(axis=0), lost.mean(axis=1)
-            spread = 1.96 * views.std(ddof=1) / len(views) ** 0.5
+            spread = uncertainty_of_mean(views.tolist())
             seen = f"({number(seeds.min(), 2)} to {number(seeds.max(), 2)})"
             cells.append(f"{give_or_take(lost.mean(), spread, 2)} {seen}")
         told = "every sample" if asked == "0" else f"{asked} lookups"
@@ -304,6 +308,7 @@ def playing(results: Results) -> list[str]:
     there, lacking = present(results, [*plays(SCENES["lego"]), *plays(SCENES["fox"])])
     rows = []
     for name in there:
+        n_views = _compared_views(results, name)
         found = results[name]["figures"]
         size = "x".join(map(str, found["size"]))
         for march in ("numba", "numpy"):
@@ -315,9 +320,18 @@ def playing(results: Results) -> list[str]:
                 for q in QUALITIES[1:]
             ]
             row = [f"{asset_name(name)}, {size}", march, where(results, name), *rates, memory]
-            rows.append([*row, *(lost if march == "numba" else ["", ""])])
-    titles = ["asset, size", "march", "machine, commit", *QUALITIES, "memory"]
+            rows.append([*row, *([n_views, *lost] if march == "numba" else ["", "", ""])])
+    titles = ["asset, size", "march", "machine, commit", *QUALITIES, "memory", "test views"]
     return titled([*titles, "`high` loses, dB", "`fast` loses, dB"], rows, lacking)
+
+
+def _compared_views(results: Results, name: str) -> str:
+    """Return how many test views the losses of a part that plays an asset are means of: as many as its
+    command asked for, or all if the scene has fewer."""
+    words = results[name]["commands"][0].split()
+    asked = int(words[words.index("--views") + 1])
+    scored = results.get(f"eval_{name.split('_')[1]}")
+    return f"{min(asked, scored['figures']['n_views'])}" if scored else ""
 
 
 def frame_parts(results: Results) -> list[str]:
@@ -390,7 +404,8 @@ def expect(results: Results) -> list[str]:
             ms = {row["quality"]: row["ms"] for row in played["rows"] if row["march"] == "numba"}
             rates = ", ".join(f"{quality} {number(1000 / ms[quality], 1)}" for quality in QUALITIES)
             size = "x".join(map(str, played["size"]))
-            rows.append([f"`vfr-play` of it at {size}, frames a second by `--quality`", rates])
+            told = f"`vfr-play` of it at {size}, frames a second by `--quality`"
+            rows.append([f"{told}, moving between training views and turning around the scene", rates])
     if not rows:
         return missing(lacking)[1:]
     machine = next(iter(results.values()))["machine"]

@@ -17,7 +17,7 @@ from tests.benchmarks.pages.cells import (
     titled,
     where,
 )
-from tests.benchmarks.pages.plots import plot_name
+from tests.benchmarks.pages.plots import played_rows, plot_name
 from tests.benchmarks.pages.tables import asset_name
 from tests.benchmarks.suite.results import Results
 from tests.benchmarks.suite.scenes import SCENES
@@ -69,11 +69,6 @@ WISHES = (
 )
 
 
-def played_rows(results: Results, name: str) -> list[Row]:
-    """Return the settings of a trade that play an asset, not the full model."""
-    return [row for row in results[name]["figures"]["settings"] if row["asset"] is not None]
-
-
 def setting_name(row: Row) -> str:
     """Return the name of a setting in tables.
 
@@ -85,7 +80,8 @@ def setting_name(row: Row) -> str:
 
 
 def choose(results: Results) -> list[str]:
-    """Return the table of settings to choose for each purpose, for an object and for a capture."""
+    """Return the table of settings to choose for each purpose, for an object and for a capture, and what was
+    compared."""
     there, lacking = present(results, ["trade_lego", "trade_fox"])
     rows = []
     for wish in WISHES:
@@ -104,8 +100,14 @@ def choose(results: Results) -> list[str]:
             cells += [rate(times["median"], times["uncertainty"]), megabytes(row["n_bytes"])]
             bake = f"`vfr-bake model.pt out/ --preset {preset}`"
             rows.append([*cells, f"{bake}, `vfr-play out/ --samples {row['n_fetches']}{quality}`"])
+    compared = []
+    for name in there:
+        presets = dict.fromkeys(row["asset"].rpartition("_")[2] for row in played_rows(results, name))
+        names = ", ".join(f"`{preset}`" for preset in presets)
+        compared.append(f"{name[6:]} {names} at {results[name]['figures']['size']}")
     titles = ["for", "choose", "lost, dB", "frames a second", "MB", "commands"]
-    return titled(titles, rows, lacking)
+    told = ["", f"Compared presets, and sizes of frames: {'; '.join(compared)}."] if compared else []
+    return [*titled(titles, rows, lacking), *told]
 
 
 def scene_section(results: Results, scene: str) -> list[str]:
@@ -131,7 +133,8 @@ def scene_section(results: Results, scene: str) -> list[str]:
             cells += [rate(some["median"], some["uncertainty"]) for some in times]
             rows.append([*cells, megabytes(row["n_bytes"])])
     told = (
-        f"Test views: {conditions['n_views']}; threads: {conditions['threads']}; timed frames of a setting "
+        f"Settings are compared at {size}. Test views: {conditions['n_views']}; "
+        f"threads: {conditions['threads']}; timed frames of a setting "
         f"and size: {conditions['frames_a_setting_and_size']}; machine and commit: {where(results, name)}."
     )
     titles = [

@@ -42,7 +42,7 @@ def trade(work: Work, scene: Scene, bakes: tuple[str, ...], samples: tuple[str, 
     for row in found["settings"]:
         times = {size: {key: some[key] for key in TIMES} for size, some in row["times"].items()}
         rows.append(
-            {key: row[key] for key in ("n_fetches", "quality", "what", "n_bytes", "on_front", "peak_mb")}
+            {key: row[key] for key in ("n_fetches", "quality", "what", "n_bytes", "peak_mb")}
             | {"asset": names.get(row["asset"]), "first_picture_ms": row["first_picture_ms"]}
             | {"scores": {key: row["scores"][key] for key in ("psnr", "loss_db", "ssim", "psnr_to_model")}}
             | {"times": times}
