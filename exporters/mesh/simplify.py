@@ -56,7 +56,8 @@ def simplify_mesh(mesh: TriangleMesh, n_faces: int) -> TriangleMesh:
         few = _collapsed(mesh, max(n_faces, LEAST), cube)
         if not len(few.faces):
             break
-        mesh, cube = few, max(1.2 * cube, mean_edge(few.vertices, few.faces))
+        # a quarter of an edge, because cubes of a whole edge can merge three in four of the faces at once
+        mesh, cube = few, max(1.2 * cube, mean_edge(few.vertices, few.faces) / 4)
     return mesh
 
 
