@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from exporters.shapes.mesh import TriangleMesh, take_faces
+from player.asset.manifest import Manifest
 from player.errors import ConfigError, FormatError, ShapeError
 from tests.exporters.meshes import tetrahedron
 
@@ -52,6 +53,21 @@ def test_transformed_by_a_similarity() -> None:
 def test_transformed_refuses(matrix: np.ndarray) -> None:
     with pytest.raises(ConfigError, match="matrix"):
         tetrahedron().transformed(matrix)
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_transformed_by_any_matrix_that_a_manifest_may_have(sign: int) -> None:
+    """A `world_from_model` that is as far from a similarity as the format allows, and its inverse."""
+    products = np.eye(3) + sign * 0.999e-4 * (np.arange(9) > 0).reshape(3, 3)
+    matrix = np.eye(4)
+    matrix[:3, :3] = 2 * np.linalg.cholesky(products).T
+    Manifest(
+        generator="tests", resolution=8, feature_resolution=8, step=0.1, density_range=(-1, 1), n_channels=4,
+        view_size=(4, 3), world_from_model=tuple(map(tuple, matrix.tolist())),
+    )  # fmt: skip
+    for each in (matrix, np.linalg.inv(matrix)):
+        moved = tetrahedron().transformed(each)
+        np.testing.assert_allclose(moved.vertices, tetrahedron().vertices @ each[:3, :3].T, atol=1e-12)
 
 
 def test_take_faces_drops_unused_vertices() -> None:
