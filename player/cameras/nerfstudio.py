@@ -18,13 +18,16 @@ from typing import Any
 import numpy as np
 
 from player.cameras.camera import Camera
-from player.cameras.transforms import MAX_PIXELS_A_SIDE
+from player.cameras.transforms import MAX_FRAMES, MAX_PIXELS_A_SIDE
 from player.errors import FormatError
 from player.files.json_files import as_float, brief, parse_json, read_json
 
 PLACEMENT = "dataparser_transforms.json"
 LEAST_FPS, MOST_FPS = 0.001, 1000
 """Frames a second that a video can have."""
+LEAST_SCALE = 1e-12
+"""The least scale of a scene in nerfstudio's frame; the largest is its inverse. Matrices of others cannot be
+inverted precisely."""
 
 
 def is_camera_path(document: Any) -> bool:
@@ -44,6 +47,8 @@ def path_cameras(document: dict[str, Any], path: Path) -> list[Camera]:
     frames = document["camera_path"]
     if not isinstance(frames, list) or not frames:
         raise FormatError(f"{path}: camera_path: expected a list of at least one frame, got {brief(frames)}")
+    if len(frames) > MAX_FRAMES:
+        raise FormatError(f"{path}: camera_path: expected at most {MAX_FRAMES} frames, got {len(frames)}")
     world_from_path = _placement(path.parent / PLACEMENT)
     cameras = []
     for index, frame in enumerate(frames):
@@ -141,7 +146,12 @@ def _placement(path: Path) -> np.ndarray | None:
     if not np.allclose(matrix[:3, :3] @ matrix[:3, :3].T, np.eye(3), atol=1e-3):
         raise FormatError(f"{path}: transform: expected a rotation and a translation, got {brief(rows)}")
     applied, applied_factor = _applied(path.with_name("transforms.json"))
-    return applied @ np.linalg.inv(np.diag([factor / applied_factor] * 3 + [1]) @ matrix)
+    ratio = factor / applied_factor
+    if not LEAST_SCALE <= ratio <= 1 / LEAST_SCALE:
+        raise FormatError(
+            f"{path}: scale: expected {LEAST_SCALE} to {1 / LEAST_SCALE:.0e} times applied_scale, got {ratio}"
+        )
+    return applied @ np.linalg.inv(np.diag([ratio] * 3 + [1]) @ matrix)
 
 
 def _applied(path: Path) -> tuple[np.ndarray, float]:

@@ -6,6 +6,7 @@ The axes and pixel conventions of the file are those of `player.cameras.camera`.
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,14 @@ from player.files.json_files import as_float, brief, parse_json, read_json
 
 PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", ".exr")
 MAX_PIXELS_A_SIDE = 65536
+MAX_FRAMES = 100_000
+"""The most frames of a file of cameras: reading so many takes seconds."""
+MAX_PATH = 4096
+"""The most characters of a `file_path`: no system opens longer ones."""
+MAX_NAME_PARTS = 16
+"""The most folders and stem that become the name of a frame's file."""
+_UNWRITABLE = re.compile("[\0-\x1f\x7f\x85\u2028\u2029\ud800-\udfff]")
+"""Characters that cannot be in a file name: control characters, line ends and halves of surrogate pairs."""
 PINHOLE_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "RADIAL", "SIMPLE_RADIAL")
 
 
@@ -47,12 +56,18 @@ def parse_transforms(data: bytes, where: str) -> dict[str, Any]:
     frames = document.get("frames")
     if not isinstance(frames, list) or not frames:
         raise FormatError(f"{where}: frames: expected a list of at least one frame, got {brief(frames)}")
+    if len(frames) > MAX_FRAMES:
+        raise FormatError(f"{where}: frames: expected at most {MAX_FRAMES}, got {len(frames)}")
     for index, frame in enumerate(frames):
         if not isinstance(frame, dict):
             raise FormatError(f"{where}: frame {index}: expected an object, got {brief(frame)}")
         name = frame.get("file_path")
-        if not isinstance(name, str) or not name or any(_unwritable(c) for c in name):
+        if not isinstance(name, str) or not name or _UNWRITABLE.search(name):
             raise FormatError(f"{where}: frame {index}: file_path: expected a path, got {brief(name)}")
+        if len(name) > MAX_PATH:
+            raise FormatError(
+                f"{where}: frame {index}: file_path: expected at most {MAX_PATH} characters, got {len(name)}"
+            )
         place = f"{where}: frame {index} ({brief(name)})"
         model = frame.get("camera_model", document.get("camera_model", "PINHOLE"))
         if model not in PINHOLE_MODELS:
@@ -138,8 +153,8 @@ def write_cameras(cameras: Sequence[Camera]) -> bytes:
 def frame_names(cameras: Sequence[Camera]) -> list[str]:
     """Return a file stem for each camera, all different on any file system, without separators.
 
-    Cameras that share a stem get the names of their folders put before it, joined with `_`, and a running
-    number if that is not enough.
+    Cameras that share a stem get the names of their innermost folders put before it, joined with `_`, and a
+    running number if that is not enough.
 
     >>> pose = np.eye(4)
     >>> names = ["./test/r_0", "images/0001.jpg", "left/a.png", "right/a.png", "right/a.png"]
@@ -165,16 +180,15 @@ def frame_names(cameras: Sequence[Camera]) -> list[str]:
                     deeper = True
     names = [name_of(i) for i in range(len(parts))]
     taken = {name.casefold() for name in names}
-    seen: set[str] = set()
+    numbers: dict[str, int] = {}  # the last number that was tried for a name
     for i, name in enumerate(names):
-        number = 0
-        while names[i].casefold() in seen:
+        key = name.casefold()
+        number = numbers.get(key)
+        while number is not None and names[i].casefold() in taken:
             number += 1
-            candidate = f"{name}_{number}"
-            if candidate.casefold() not in taken:
-                names[i] = candidate
-                taken.add(candidate.casefold())
-        seen.add(names[i].casefold())
+            names[i] = f"{name}_{number}"
+        numbers[key] = number or 0
+        taken.add(names[i].casefold())
     return names
 
 
@@ -250,15 +264,11 @@ def _matrix(rows: Any) -> np.ndarray:
     return np.array([*rows, [0, 0, 0, 1]][:4], np.float64)
 
 
-def _unwritable(character: str) -> bool:
-    """Return whether a character cannot be in a file name: control characters, line ends and halves of
-    surrogate pairs."""
-    return character < " " or character in "\x7f\x85\u2028\u2029" or "\ud800" <= character <= "\udfff"
-
-
 def _name_parts(name: str) -> list[str]:
-    """Return the folders and the stem of a picture's path, made fit for file names on any system."""
+    """Return the innermost folders and the stem of a picture's path, made fit for file names on any
+    system."""
     parts = [part for part in name.replace("\\", "/").split("/") if part not in ("", ".", "..")]
+    parts = parts[-MAX_NAME_PARTS:]
     if parts and parts[-1].lower().endswith(PICTURE_SUFFIXES):
         parts[-1] = parts[-1].rpartition(".")[0]
     safe = ["".join(c if c.isprintable() and c not in '<>:"|?*' else "_" for c in part) for part in parts]

@@ -241,6 +241,8 @@ BAD: list[tuple[str, Any, tuple[str, ...]]] = [
     ("no path", {"frames": [{}]}, ("frame 0", "file_path", "got None")),
     ("path with a line's end", blender(file_path="a\nb"), ("frame 0", "file_path", "a b")),
     ("path with half a pair", blender(file_path="\ud800"), ("frame 0", "file_path", "ud800")),
+    ("path too long", blender(file_path="a/" * 2049), ("file_path: expected at most 4096", "got 4098")),
+    ("too many frames", {"frames": [{}] * 100_001}, ("frames: expected at most 100000, got 100001",)),
     ("no matrix", blender(transform_matrix=None), ("frame 0 (./train/r_0)", "4 rows of 4", "got None")),
     ("5 rows", blender(transform_matrix=[[0] * 4] * 5), ("4 rows of 4", "got 5 rows")),
     ("short row", blender(transform_matrix=[[1, 2, 3]] * 4), ("4 rows of 4", "row 0: [1, 2, 3]")),
@@ -368,6 +370,13 @@ def test_frame_names():
     assert named("a", "a", "a_1") == ["a", "a_2", "a_1"]
     assert named("A", "a") == ["A", "a_1"]
     assert named("..", "../../etc/passwd", "") == ["frame", "passwd", "frame_1"]
+
+
+def test_frame_names_of_deep_folders_and_of_many_equal_paths():
+    """At most sixteen names of a path are used, and a number is not tried again for the next equal path."""
+    deep = "a_" * 15 + "x"
+    assert named("1/" + "a/" * 20 + "x", "2/" + "a/" * 20 + "x") == [deep, f"{deep}_1"]
+    assert named(*["a"] * 30_000)[-1] == "a_29999"
 
 
 @given(st.lists(st.text(alphabet="aA.1_/\\: ", max_size=7), min_size=1, max_size=12))

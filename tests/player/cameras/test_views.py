@@ -64,6 +64,8 @@ def test_nerfstudios_placement_of_the_scene_is_undone(tmp_path: Path) -> None:
     write(tmp_path, {"transform": transform.tolist(), "scale": 0.25}, "dataparser_transforms.json")
     np.testing.assert_allclose(read_views(path)[0].c2w, POSE, atol=1e-12)
     for broken in ({"scale": 1}, {"transform": transform.tolist(), "scale": 0}, [],
+                   {"transform": transform.tolist(), "scale": 5e-324},
+                   {"transform": transform.tolist(), "scale": 1e300},
                    {"transform": (2 * transform).tolist(), "scale": 1}):  # fmt: skip
         write(tmp_path, broken, "dataparser_transforms.json")
         with pytest.raises(FormatError, match=r"dataparser_transforms\.json: "):
@@ -85,7 +87,7 @@ def test_what_nerfstudio_had_done_to_the_cameras_before_is_not_undone(tmp_path: 
     data = {"frames": [], "applied_transform": applied.tolist(), "applied_scale": 3.0}
     write(tmp_path, data, "transforms.json")
     np.testing.assert_allclose(read_views(path)[0].c2w, POSE, atol=1e-12)
-    for broken in ({"applied_transform": [1]}, {"applied_scale": 0}, []):
+    for broken in ({"applied_transform": [1]}, {"applied_scale": 0}, {"applied_scale": 1e-300}, []):
         write(tmp_path, broken, "transforms.json")
         with pytest.raises(FormatError, match=r"transforms\.json: "):
             read_views(path)
@@ -113,6 +115,7 @@ BAD_PATHS: list[tuple[Any, str]] = [
     (path_document() | {"render_height": 1e9}, "render_height: expected 1 to 65536 whole pixels"),
     (path_document() | {"camera_type": "fisheye"}, "camera_type: expected perspective, got fisheye"),
     (path_document() | {"camera_path": []}, "camera_path: expected a list of at least one frame"),
+    (path_document() | {"camera_path": [3] * 100_001}, "camera_path: expected at most 100000 frames, got"),
     (path_document() | {"camera_path": [3]}, "frame 0: expected an object, got 3"),
     ('{"camera_path": NaN}', "expected JSON, got NaN"),
 ]
