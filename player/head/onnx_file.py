@@ -9,6 +9,7 @@ same way. Field numbers are those of onnx.proto.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -18,6 +19,8 @@ from player.errors import FormatError
 
 FLOAT, UINT8, INT8, INT32 = 1, 2, 3, 6
 """TensorProto's numbers for the data types that are read."""
+MAX_FIELDS = 10_000
+"""The most fields of all messages in a file: a head of the most layers has a quarter of them."""
 _TYPES = {FLOAT: "<f4", UINT8: "u1", INT8: "i1", INT32: "<i4"}
 
 
@@ -105,8 +108,9 @@ def read_graph(data: bytes, where: str) -> Graph:
     Raises:
         FormatError: the bytes are no ONNX file, or hold something that no head of this project does.
     """
-    model = _message(data, _MODEL, where)
-    graph = model.get("graph", _message(b"", _GRAPH, where))
+    left = iter(range(MAX_FIELDS))
+    model = _message(data, _MODEL, where, left)
+    graph = model.get("graph", _message(b"", _GRAPH, where, left))
     operators = model["opset_import"]
     if len(operators) != 1 or operators[0].get("domain", "") != "" or "version" not in operators[0]:
         raise FormatError(f"{where}: expected an ONNX graph, got one without one version of ONNX's operators")
@@ -162,12 +166,14 @@ def _port(message: dict[str, Any], where: str) -> Port:
     return Port(name, dims[1]["dim_value"])
 
 
-def _message(data: bytes, fields: dict[int, _Field], where: str) -> dict[str, Any]:
+def _message(data: bytes, fields: dict[int, _Field], where: str, left: Iterator[int]) -> dict[str, Any]:
     """Decode the fields of a protobuf message by name: repeated fields as lists, the others if they are
-    present."""
+    present. Each field takes an item of `left`."""
     values: dict[str, Any] = {field.name: [] for field in fields.values() if field.repeated}
     at = 0
     while at < len(data):
+        if next(left, None) is None:
+            raise FormatError(f"{where}: expected at most {MAX_FIELDS} fields in a head, got more")
         key, at = _varint(data, at, where)
         field = fields.get(key >> 3)
         if field is None:
@@ -179,7 +185,7 @@ def _message(data: bytes, fields: dict[int, _Field], where: str) -> dict[str, An
             piece, at = data[at : at + value], at + value
             if at > len(data):
                 raise FormatError(f"{where}: expected an ONNX graph, got one cut short")
-            value = _content(piece, field.kind, where)
+            value = _content(piece, field.kind, where, left)
         if field.repeated:
             values[field.name].append(value)
         elif field.name in values:
@@ -189,11 +195,11 @@ def _message(data: bytes, fields: dict[int, _Field], where: str) -> dict[str, An
     return values
 
 
-def _content(piece: bytes, kind: Any, where: str) -> Any:
+def _content(piece: bytes, kind: Any, where: str, left: Iterator[int]) -> Any:
     if kind is bytes:
         return piece
     if kind is not str:
-        return _message(piece, kind, where)
+        return _message(piece, kind, where, left)
     try:
         return piece.decode()
     except UnicodeDecodeError as error:

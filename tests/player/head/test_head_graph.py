@@ -240,9 +240,10 @@ def test_messages_that_can_be_read_in_two_ways(path: tuple[int, ...], more: byte
         (b"#!/bin/sh\n", "expected an ONNX graph"),
         (b"\xff" * 300_000, "an integer of more than 64 bits"),
         (PLAIN[:-40], "got one cut short"),
+        (b"\x3a" + varint(40_000) + b"\x0a\x00" * 20_000, "expected at most 10000 fields in a head"),
         (head_onnx(random_head(9, 32)), r"features: expected float \[n, 8\], got \[n, 9\]"),
     ],
-    ids=["empty", "script", "noise", "cut", "9 channels"],
+    ids=["empty", "script", "noise", "cut", "nodes", "9 channels"],
 )
 def test_files_that_are_no_head(data: bytes, message: str) -> None:
     refused(data, message)
