@@ -13,9 +13,10 @@ DENSITY_BRICK = (8, 8, 10)
 of a column, which tells which cells of the column are live."""
 COLUMN_BRICK = (9, 8, 1)
 """Texels, of four numbers of 32 bits each, of a brick that gives the rows of features."""
-MOST_LAYERS = 25
-"""Most bricks on top of each other in a texture."""
-MOST_BRICKS = MOST_LAYERS * 256**2
+FEW_LAYERS = 25
+"""Most bricks on top of each other in a texture that is higher than wide."""
+MOST_LAYERS = 256
+MOST_BRICKS = FEW_LAYERS * 256**2
 WIDTH = 2048
 """Most texels of a line of features."""
 LINES_A_LAYER = 256
@@ -59,16 +60,29 @@ def gpu_bytes(asset: Asset) -> int:
 
 
 def block_texels(n: int, brick: tuple[int, int, int]) -> int:
-    """Return the number of texels of a texture of `n` bricks, with at most MOST_LAYERS on top of each other
-    and as many along its width as along its height.
+    """Return the number of texels of a texture of `n` bricks.
 
     >>> block_texels(0, (8, 8, 10)), block_texels(25, (8, 8, 10)), block_texels(26, (8, 8, 10))
     (640, 16000, 17920)
     """
+    across, layers = block_shape(n, brick)
+    return across**2 * layers * math.prod(brick)
+
+
+def block_shape(n: int, brick: tuple[int, int, int]) -> tuple[int, int]:
+    """Return how many bricks a texture of `n` bricks has along its width and its height, and on top of each
+    other: `blockOf` in `grid.js`, which says why.
+
+    >>> block_shape(25, (8, 8, 10)), block_shape(26, (8, 8, 10)), block_shape(200_000, (9, 8, 1))
+    ((1, 25), (2, 7), (29, 238))
+    """
     if n > MOST_BRICKS:
         raise FormatError(f"graphics memory: expected at most {MOST_BRICKS} bricks, got {n}")
+    width, _, height = brick
     across = max(math.ceil(math.sqrt(n / MOST_LAYERS)), 1)
-    return across**2 * max(-(-n // across**2), 1) * math.prod(brick)
+    while (layers := max(-(-n // across**2), 1)) > FEW_LAYERS and across * width < layers * height:
+        across += 1
+    return across, layers
 
 
 def feature_bytes(n: int, n_channels: int) -> int:

@@ -23,6 +23,7 @@ export const DENSITY_BRICK = [8, 8, 10]; // texels
 export const COLUMN_BRICK = [9, 8, 1];
 export const LINES_A_LAYER = 256;
 
+const MOST_BRICKS = 25 * 256 ** 2;
 const AROUND = 9 ** 3; // vertices of a brick with its apron
 
 const bricksAlong = (cells) => Math.ceil(cells / 8);
@@ -33,11 +34,15 @@ export const featureWords = (nChannels) => Math.ceil(nChannels / 4);
 export const rowsALine = (nChannels) => 2 ** Math.floor(Math.log2(2048 / featureWords(nChannels)));
 
 // Arrange n bricks in a texture: { across, layers, size: [3] texels }. Brick i is at (i % across, i / across % across,
-// i / across^2), in bricks. There are at most 25 layers, so that few places are left over, and no side is longer than
-// necessary.
+// i / across^2), in bricks. `across` is the least with which the block is not higher than wide, or has at most 25 layers: no
+// side is long, because there are devices that have no 3D textures of more than 256 texels a side, and few places are left
+// over. There are at most 256 layers, whose numbers are stored in a byte.
 export function blockOf(n, brick) {
-  const across = Math.max(Math.ceil(Math.sqrt(n / 25)), 1), layers = Math.max(Math.ceil(n / across ** 2), 1);
-  if (across > 256) throw new Error(`memory of the GPU: expected at most ${25 * 256 ** 2} bricks, got ${n}`);
+  if (n > MOST_BRICKS) throw new Error(`memory of the GPU: expected at most ${MOST_BRICKS} bricks, got ${n}`);
+  const layersOf = (across) => Math.max(Math.ceil(n / across ** 2), 1);
+  let across = Math.max(Math.ceil(Math.sqrt(n / 256)), 1);
+  while (layersOf(across) > 25 && across * brick[0] < layersOf(across) * brick[2]) across++;
+  const layers = layersOf(across);
   return { across, layers, size: [across * brick[0], across * brick[1], layers * brick[2]] };
 }
 

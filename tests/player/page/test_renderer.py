@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import shutil
 import subprocess
 from collections.abc import Callable, Iterator
@@ -19,7 +18,8 @@ from player.asset.asset import Asset
 from player.asset.grid import DISTANCE_BITS, MAX_DISTANCE, SparseGrid
 from player.cameras.camera import Camera
 from player.cameras.views import asset_cameras
-from player.page.gpu_memory import gpu_bytes
+from player.page.gpu_memory import COLUMN_BRICK, DENSITY_BRICK, block_shape, gpu_bytes
+from player.page.page import page_script, web_files
 from player.render import Renderer
 from player.viewer.layers import coloured
 from tests.numerics.bounds import Row
@@ -158,32 +158,59 @@ def test_the_arrays_are_the_players(scene: Scene) -> None:
     found, grid = scene.page.page.evaluate("() => arrays()"), scene.asset.grid
     table = scene.page.array(found["table"], np.uint8).reshape(-1, 4)
     check_table(entries_of(table, found["nSlots"]), grid)
-    texels = unblocked(scene.page.array(found["density"], np.uint8), found["nSlots"], (8, 8, 10))
+    texels = unblocked(scene.page.array(found["density"], np.uint8), found["nSlots"], DENSITY_BRICK)
     codes = grid.codes.reshape(-1, 9, 9, 9)
     assert (texels[:, :, :, :9] == corners(codes)).all()
     live = texels[..., 9, 0]
     assert (live.reshape(-1) == grid.live).all()
     owners = scene.page.array(found["owners"], np.uint8).astype(np.int64).reshape(-1, 4)
-    numbers = number_of(owners[:, :3], found["nHeld"]) << 3 | owners[:, 3]
+    numbers = number_of(owners[:, :3], found["nHeld"], COLUMN_BRICK) << 3 | owners[:, 3]
     assert (np.where(owners[:, 3] < 255, numbers, -1) == grid.rows.bricks).all()
     texels = scene.page.array(found["columns"], np.uint32)
     wanted = grid.rows.rows.reshape(-1, 9, 9, 9)[: found["nHeld"]]
-    assert (corners_of(unblocked(texels, found["nHeld"], (9, 8, 1))) == pairs(wanted)).all()
+    assert (corners_of(unblocked(texels, found["nHeld"], COLUMN_BRICK)) == pairs(wanted)).all()
     n_channels, n_words = grid.n_channels, -(-grid.n_channels // 4)
     features = scene.page.array(found["features"], np.int8).reshape(-1, 4 * n_words)[:, :n_channels]
     ARRAYS.holds(features == grid.features[: len(features)])
     assert scene.page.page.evaluate("() => vfr.info.gpuBytes") == gpu_bytes(scene.asset)
 
 
-def number_of(place: np.ndarray, count: int) -> np.ndarray:
+BLOCKS = """
+import { blockOf, COLUMN_BRICK, DENSITY_BRICK } from "./grid.js";
+globalThis.blocks = (counts) => [DENSITY_BRICK, COLUMN_BRICK].map((brick) => counts.map((n) => {
+  const { across, layers } = blockOf(n, brick);
+  return [across, layers];
+}));
+"""
+
+
+def test_textures_are_short_enough_for_devices_of_small_ones(chromium: Browser) -> None:
+    """A page whose textures fill the 512 MB that are exported by default has none of more than 512 texels a
+    side, and one of 64 MB none of more than 256, which every device has."""
+    counts = [0, 1, 25, 26, 192, 193, 1000, 25_600, 100_000, 200_000]
+    page = chromium.new_page()
+    script = page_script({**web_files(), "main.js": BLOCKS}, "main.js", "main.js")
+    page.set_content(f'<script type="module">{script}</script>')
+    page.wait_for_function("() => globalThis.blocks")
+    blocks = page.evaluate("counts => blocks(counts)", counts)
+    page.close()
+    for brick, found in zip((DENSITY_BRICK, COLUMN_BRICK), blocks, strict=True):
+        assert [tuple(each) for each in found] == [block_shape(n, brick) for n in counts]
+        for n, (across, layers) in zip(counts, found, strict=True):
+            assert across**2 * layers >= n and max(across, layers) <= 256
+            most = 256 if n <= 25_600 else 512
+            assert max(across * brick[0], across * brick[1], layers * brick[2]) <= most, n
+
+
+def number_of(place: np.ndarray, count: int, brick: tuple[int, int, int]) -> np.ndarray:
     """Return the numbers [n] of bricks at places [n, 3] of a texture of `count` bricks."""
-    across = max(math.ceil(math.sqrt(count / 25)), 1)
+    across, _ = block_shape(count, brick)
     return place[:, 0] + across * (place[:, 1] + across * place[:, 2])
 
 
 def unblocked(texels: np.ndarray, count: int, brick: tuple[int, int, int]) -> np.ndarray:
     """Return the bricks [count, x, y, z, 4] of a texture."""
-    across = max(math.ceil(math.sqrt(count / 25)), 1)
+    across, _ = block_shape(count, brick)
     x, y, z = brick
     split = texels.reshape(-1, z, across, y, across, x, 4)
     return split.transpose(0, 2, 4, 5, 3, 1, 6).reshape(-1, x, y, z, 4)[:count]
@@ -216,7 +243,7 @@ def entries_of(table: np.ndarray, count: int) -> np.ndarray:
     brick with the level of a dead brick in the higher bits."""
     place, kind = table[:, :3].astype(np.int64), table[:, 3].astype(np.int64)
     nowhere = -(kind | place[:, 0] << DISTANCE_BITS)
-    return np.where(kind < 32, nowhere, number_of(place, count) << 3 | (kind - 32))
+    return np.where(kind < 32, nowhere, number_of(place, count, DENSITY_BRICK) << 3 | (kind - 32))
 
 
 def check_table(found: np.ndarray, grid: SparseGrid) -> None:
