@@ -27,7 +27,7 @@ from player.progress import Progress
 from vfr_bake.data.capture import Capture, PosedImages, held_out
 from vfr_bake.data.files.estimate_record import read_record
 from vfr_bake.data.files.listing import find_pictures, other_kinds
-from vfr_bake.data.files.masks import mask_of, stray_masks
+from vfr_bake.data.files.masks import is_file, mask_of, stray_masks
 from vfr_bake.data.files.opening import SUFFIXES, open_photograph
 from vfr_bake.data.files.orientation import is_taken_upright
 from vfr_bake.data.files.pictures import DescribedView, picture_layout, read_picture
@@ -269,7 +269,7 @@ def _mask(path: Path, index: int, frame: dict[str, Any], picture: Path) -> Path 
     named = frame.get("mask_path")
     if named is not None:
         for form in (named, named.replace("\\", "/")) if isinstance(named, str) else ():
-            if _is_file(root / form):
+            if is_file(root / form):
                 return root / form
         where = f"{path}: frame {index} ({frame['file_path']})"
         raise DataError(f"{where}: mask_path: expected a picture, got {brief(named)}")
@@ -302,19 +302,12 @@ def _picture_path(transforms: Path, index: int, frame: dict[str, Any]) -> Path:
     for form in (name, name.replace("\\", "/")):
         path = transforms.parent / form
         for candidate in (path, *(path.with_name(path.name + suffix) for suffix in SUFFIXES if path.name)):
-            if _is_file(candidate):
+            if is_file(candidate):
                 return candidate
     expected = f"expected {transforms.parent / name}"
     if not name.lower().endswith(SUFFIXES):
         expected += f" with one of {', '.join(SUFFIXES)}"
     raise DataError(f"{transforms}: frame {index} ({name}): picture is missing: {expected}")
-
-
-def _is_file(path: Path) -> bool:
-    try:
-        return path.is_file()
-    except OSError:  # the name is too long; before Python 3.14 this raises
-        return False
 
 
 def load_colmap_folder(
@@ -415,4 +408,4 @@ def _found_picture(folder: Path, name: str) -> Path | None:
     if inside.is_absolute() or ".." in inside.parts:
         raise FormatError(f"{folder}: {name}: expected a picture inside the folder")
     candidates = (folder / "images" / inside, folder / inside)
-    return next((candidate for candidate in candidates if candidate.is_file()), None)
+    return next((candidate for candidate in candidates if is_file(candidate)), None)

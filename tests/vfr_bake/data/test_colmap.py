@@ -136,6 +136,10 @@ def test_what_cannot_be_served_is_said(folder: Path, tmp_path: Path) -> None:
     (folder / "images/004.png").unlink()
     with pytest.raises(DataError, match=r"004\.png: picture is missing"):
         load_folder(folder)
+    path = folder / "sparse/0/images.bin"
+    path.write_bytes(path.read_bytes().replace(b"004.png", b"4" * 300 + b".png"))
+    with pytest.raises(DataError, match=r"444\.png: picture is missing"):
+        load_folder(folder)
     fisheye = write_model(tmp_path / "fish", demo_cameras(SIZE, 4), {1: (5, [9.0] * 8)})
     with pytest.raises(DataError, match=r"model: expected SIMPLE_PINHOLE, .* got number 5"):
         load_folder(fisheye)

@@ -41,9 +41,21 @@ def mask_of(root: Path, picture: str) -> Path | None:
         places.append(Path(*name.parts[1:]))
     for place in places:
         for candidate in (place.with_suffix(".png"), place.with_name(place.name + ".png")):
-            if (root / FOLDER / candidate).is_file():
+            if is_file(root / FOLDER / candidate):
                 return root / FOLDER / candidate
     return None
+
+
+def is_file(path: Path) -> bool:
+    """Return whether `path` is a file; no file has a name that is too long.
+
+    >>> is_file(Path("a" * 300))
+    False
+    """
+    try:
+        return path.is_file()
+    except OSError:  # the name is too long; before Python 3.14 this raises
+        return False
 
 
 def stray_masks(root: Path, used: Collection[Path | None]) -> str | None:

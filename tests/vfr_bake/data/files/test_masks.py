@@ -136,6 +136,7 @@ def test_names(tmp_path: Path) -> None:
     for name, mask in {"a.jpg": "a.png", "images/b.jpg": "b.jpg.png", "sub/c.heic": "sub/c.png"}.items():
         assert mask_of(tmp_path, name) == tmp_path / "masks" / mask
     assert mask_of(tmp_path, "d.jpg") is None and mask_of(tmp_path, "../a.jpg") is None
+    assert mask_of(tmp_path, "d" * 251 + ".jpg") is None  # with .png behind it, it is too long for a system
 
 
 def test_masks_that_belong_to_no_picture_are_told_of(tmp_path: Path) -> None:
