@@ -13,7 +13,6 @@ from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from threading import Thread
 from typing import NamedTuple
-from urllib.request import urlopen
 
 import numpy as np
 import pytest
@@ -26,11 +25,9 @@ from player.errors import ConfigError, FormatError
 from player.page import page
 from player.page.gpu_memory import MOST_CHANNELS, decoding_bytes, feature_bytes
 from player.page.modules import joined
-from player.page.notebook import inline
 from player.page.page import page_of_many_files, page_of_one_file, page_script, web_files
 from player.page.scene_files import scene_files
 from player.page.text_bytes import ALPHABET, bytes_of_text, text_of_bytes
-from player.viewer.server import ServeSettings, serve
 from tests.player.page import scenes
 from tests.player.page.viewer_page import wait_for
 
@@ -194,17 +191,6 @@ def test_more_graphics_memory_than_may_be_is_refused(asset: Asset, tmp_path: Pat
     with pytest.raises(ConfigError, match=r"expected at most 1 MB, got \d+ MB: bake it smaller"):
         export_asset(asset.folder, tmp_path / "scene.html", ExportOptions(max_gpu_mb=1))
     assert not list(tmp_path.iterdir())
-
-
-def test_no_page_but_an_exported_one_is_refused_for_its_graphics_memory(
-    asset: Asset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The viewer and notebooks have no option that would allow more; each visitor's device decides."""
-    monkeypatch.setitem(page_of_one_file.__globals__, "gpu_bytes", lambda asset: 600_000_000)
-    with serve(asset, ServeSettings(march="numpy")) as address, urlopen(f"{address}/page") as answer:
-        assert answer.read() == inline(asset).content == page(asset)
-    with pytest.raises(ConfigError, match=r"expected at most 512 MB, got 600 MB: .* more \(--max-gpu-mb\)"):
-        export_asset(asset.folder, tmp_path / "scene.html")
 
 
 def test_more_memory_than_browsers_give_a_page_is_refused(

@@ -8,20 +8,24 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+from urllib.request import urlopen
 
 import numpy as np
 import pytest
 from PIL import Image
 from playwright.sync_api import Browser, Page
 
+from exporters.export import export_asset
 from player.asset.asset import Asset
 from player.cameras.camera import Camera
 from player.cameras.views import asset_cameras
+from player.errors import ConfigError
 from player.files.images import to_8_bit
 from player.page.notebook import inline
 from player.page.page import page as page_of
 from player.page.rest import rest_camera
 from player.render import Renderer
+from player.viewer.server import ServeSettings, serve
 from tests.player.page.viewer_page import SECONDS, wait_for
 
 SIZE = {"width": 300, "height": 245}
@@ -185,3 +189,14 @@ def test_a_notebook_shows_it_below_a_cell(chromium: Browser, asset: Asset, tmp_p
     assert not card.is_visible()
     context.close()
     assert not said
+
+
+def test_no_page_but_an_exported_one_is_refused_for_its_graphics_memory(
+    asset: Asset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The viewer and notebooks have no option that would allow more; each visitor's device decides."""
+    monkeypatch.setitem(page_of.__globals__, "gpu_bytes", lambda asset: 600_000_000)
+    with serve(asset, ServeSettings(march="numpy")) as address, urlopen(f"{address}/page") as answer:
+        assert answer.read() == inline(asset).content == page_of(asset)
+    with pytest.raises(ConfigError, match=r"expected at most 512 MB, got 600 MB: .* more \(--max-gpu-mb\)"):
+        export_asset(asset.folder, tmp_path / "scene.html")
