@@ -280,7 +280,7 @@ def _is_deeper(value: object, most: int) -> bool:
 
 
 def _refuse(text: str) -> float:
-    raise ValueError(f"{text} is not a number of JSON")
+    raise ValueError(f"{text[:80]} is not a number of JSON")
 
 
 def _each_once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

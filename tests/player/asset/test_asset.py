@@ -314,6 +314,13 @@ def test_nan_and_infinity_are_refused_both_ways(text: str, asset: Asset) -> None
         manifest_bytes(replace(asset.manifest, provenance={"psnr": float(text)}))
 
 
+def test_a_number_of_a_million_digits_is_refused_in_one_short_line(asset: Asset) -> None:
+    data = manifest_bytes(asset.manifest).replace(b"30.5", b"9" * 1_000_000 + b".0")
+    with pytest.raises(FormatError, match="is not a number of JSON") as caught:
+        parse_manifest(data, "m.json")
+    assert len(str(caught.value)) < 200
+
+
 @pytest.mark.parametrize("data", [b"", b"[]", b"{", b"\xff\xfe", b"[" * 100_000, b" " * (MAX_BYTES + 1)])
 def test_not_a_manifest(data: bytes) -> None:
     with pytest.raises(FormatError, match=r"m\.json: "):
