@@ -97,8 +97,8 @@ class Asset:
     n_parts: int = 0
     """Number of parts that have been read; 0 for version 3, which has none."""
     missing: str | None = None
-    """One line that says why fewer parts were read than asked for: a later one is missing, cut short, changed
-    or broken. None if all were read. The asset can be played either way."""
+    """One line that says why fewer parts were read than asked for: a later one is missing, cut short,
+    changed, broken or not in its place. None if all were read. The asset can be played either way."""
 
     @classmethod
     def open(
@@ -115,7 +115,8 @@ class Asset:
             verify: first compare the checksum of every file that the manifest lists, which reads every byte,
                 and raise if any part cannot be decoded. If False, a file is compared when it is read: now the
                 parts, later the head and the cameras. A part after the first that is missing, cut short,
-                changed or broken is then no error: `asset.missing` says so. The mesh is not looked at.
+                changed, broken or not in its place is then no error: `asset.missing` says so. The mesh is
+                not looked at.
             max_memory: gigabytes that the asset may take, unpacked and arranged for marching. If None, half
                 of what the machine has.
             parts: number of parts to read, 1 or more: the fewer, the coarser the picture and the sooner it
@@ -335,7 +336,7 @@ def _write_manifest(folder: Path, manifest: Manifest) -> None:
     paths = sorted(path for path in folder.iterdir() if path.name != NAME)
     files = {path.name: _entry(path) for path in paths}
     data = manifest_bytes(replace(manifest, files=files))
-    parse_manifest(data, NAME)
+    tuple(parse_manifest(data, NAME).parts_in_order())  # raises if any part is wrong
     (folder / NAME).write_bytes(data)
 
 

@@ -18,7 +18,7 @@ import numpy as np
 from player.asset.bricks import bricks_per_axis, with_corners
 from player.asset.coder.lanes import Neighbours
 from player.asset.folder import read_checked
-from player.asset.manifest import Manifest
+from player.asset.manifest import NAME, Manifest
 from player.asset.pyramid import NO_BRICKS, Pyramid, PyramidValues, values_of
 from player.asset.sections import Grid, Part, Section
 from player.asset.structure import decode_structure
@@ -171,6 +171,15 @@ class PartsReader:
             "densities": PyramidReader("densities", manifest),
             "features": PyramidReader("features", manifest),
         }
+        self._parts: list[Part] = []
+        """The parts that can be decoded one after another."""
+        self._not_in_order: FormatError | None = None
+        """Why no more of them can."""
+        try:
+            for part in manifest.parts_in_order(str(folder / NAME)):
+                self._parts.append(part)
+        except FormatError as error:
+            self._not_in_order = error
         self.n_read = 0
         """Parts that have been read."""
         self._taken = 0
@@ -180,14 +189,14 @@ class PartsReader:
         """Read further parts until `n_parts` are read, or one cannot be. The memory of the parts read before
         is counted too, because their picture may still be shown.
 
-        Raises FormatError, IntegrityError: a part is missing, changed or breaks the format; the parts before
-        it have been read. ConfigError: the parts take more memory than is allowed.
+        Raises FormatError, IntegrityError: a part is missing, changed, not in its place or breaks the format;
+        the parts before it have been read. ConfigError: the parts take more memory than is allowed.
         """
-        parts = self._manifest.parts[self.n_read : n_parts]
+        parts = self._parts[self.n_read : n_parts]
         allowed = self._allowed - self._taken
         check_memory(self._stated_bytes(n_parts), allowed, str(self._folder))
         read: list[list[StoredSection]] = []
-        error = None
+        error = self._not_in_order if n_parts > len(self._parts) else None
         for part in parts:
             try:
                 read.append(self._sections(part))
@@ -230,7 +239,7 @@ class PartsReader:
                         if stored.section.grid == grid and stored.section.kind == "structure":
                             reader.read_structure(stored)
                     if grid == "features" and not reader.pyramid.levels[-1].masks.any():
-                        file = self._folder / self._manifest.parts[self.n_read + number].file
+                        file = self._folder / self._parts[self.n_read + number].file
                         raise FormatError(  # every sample with weight needs a feature
                             f"{file}: expected a live cell of the features, got none"
                         )
@@ -293,7 +302,7 @@ class PartsReader:
     def _stated_bytes(self, n_parts: int) -> int:
         """Return the bytes that the first parts will take at least, by the numbers in the manifest; each
         brick of cells has at least one brick of vertices."""
-        stored = [section for part in self._manifest.parts[:n_parts] for section in part.sections]
+        stored = [section for part in self._parts[:n_parts] for section in part.sections]
         counts = []
         for grid in GRIDS:
             structures = [s for s in stored if s.grid == grid and s.kind == "structure"]
@@ -327,7 +336,7 @@ class PartsReader:
         return needed_bytes(self._n_packed(n_parts), *counts)
 
     def _n_packed(self, n_parts: int) -> int:
-        return sum(part.bytes for part in self._manifest.parts[self.n_read : n_parts])
+        return sum(part.bytes for part in self._parts[self.n_read : n_parts])
 
     def _n_per_axis(self, grid: Grid) -> int:
         return bricks_per_axis(self._manifest.resolutions[grid])

@@ -8,7 +8,7 @@ each can be decoded from those before it.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -82,6 +82,9 @@ def part_name(number: int) -> str:
     return f"part_{number}.bin"
 
 
+PART_NAMES = tuple(map(part_name, range(MAX_PARTS)))
+
+
 def parts_as_json(parts: Sequence[Part]) -> list[dict[str, Any]]:
     """Return the value of the manifest's key `parts`."""
     return [
@@ -101,8 +104,8 @@ def _section_as_json(section: Section) -> dict[str, Any]:
 def parse_parts(where: str, value: object, newer: bool = False) -> tuple[Part, ...]:
     """Parse the manifest's `parts`, and check that each number is within its bounds. Raises FormatError.
 
-    `newer`: whether the manifest is of a newer minor version, whose unknown keys are ignored. `check_parts`
-    checks that the parts agree with the rest of the manifest.
+    `newer`: whether the manifest is of a newer minor version, whose unknown keys are ignored.
+    `in_order` checks that the parts agree with each other and with the rest of the manifest.
     """
     if isinstance(value, tuple) and all(isinstance(part, Part) for part in value):
         value = parts_as_json(value)
@@ -118,7 +121,7 @@ def parse_parts(where: str, value: object, newer: bool = False) -> tuple[Part, .
 def _parse_part(where: str, number: int, value: object, newer: bool) -> Part:
     if not isinstance(value, dict) or not _has_keys(value, {"file", "sections"}, newer):
         raise FormatError(f"{where}: expected an object with file and sections, got {_show(value)}")
-    if value["file"] != part_name(number):
+    if value["file"] not in PART_NAMES:
         raise FormatError(f"{where}: file: expected {part_name(number)}, got {_show(value['file'])}")
     sections = value["sections"]
     if not isinstance(sections, list) or not 1 <= len(sections) <= MAX_SECTIONS:
@@ -156,35 +159,46 @@ def _parse_section(where: str, value: object, newer: bool) -> Section:
     return Section(**{key: value[key] for key in keys})
 
 
-def check_parts(
-    parts: Sequence[Part], resolutions: dict[Grid, int], n_levels: dict[Grid, int], n_channels: int
-) -> None:
-    """Raise FormatError unless every section can be decoded from those before it and fits into its pyramid.
+def in_order(
+    where: str,
+    parts: Sequence[Part],
+    resolutions: dict[Grid, int],
+    n_levels: dict[Grid, int],
+    n_channels: int,
+) -> Iterator[Part]:
+    """Yield the parts whose sections can be decoded from those before them and fit into their pyramids.
 
     A structure comes after that of the next coarser level. Symbols come after the structure of their level,
     after those of the channels before them, and after those of the same channels on the next coarser level.
 
     Args:
+        where: the manifest's name in error messages.
         parts: the parts, as `parse_parts` returns them.
         resolutions: cells along each axis of the finest level of each pyramid.
         n_levels: number of levels of each pyramid.
         n_channels: channels of the features.
+
+    Raises FormatError, in place of the first part that cannot be decoded.
     """
     known = {grid: [-1] * n for grid, n in n_levels.items()}
     n_rows: dict[Grid, int] = {"densities": 0, "features": 0}
     for number, part in enumerate(parts):
+        name = part_name(number)
+        if part.file != name:
+            raise FormatError(f"{where}: parts: {number}: file: expected {name}, got {part.file}")
         for section in part.sections:
-            where = f"manifest: parts: {number}: {section.name}"
+            place = f"{where}: parts: {number}: {section.name}"
             if section.level >= n_levels[section.grid]:
-                raise FormatError(f"{where}: expected a level below {n_levels[section.grid]}")
+                raise FormatError(f"{place}: expected a level below {n_levels[section.grid]}")
             if section.kind == "structure":
-                _check_structure(section, resolutions[section.grid], where)
+                _check_structure(section, resolutions[section.grid], place)
                 n_rows[section.grid] += section.n_vertices
                 if n_rows[section.grid] > MAX_ROWS:
-                    raise FormatError(f"{where}: expected at most {MAX_ROWS} vertices, got more")
+                    raise FormatError(f"{place}: expected at most {MAX_ROWS} vertices, got more")
             elif not 1 <= section.n_channels <= _channels(section.grid, n_channels) - section.first_channel:
-                raise FormatError(f"{where}: expected channels below {_channels(section.grid, n_channels)}")
-            _check_order(section, known[section.grid], where)
+                raise FormatError(f"{place}: expected channels below {_channels(section.grid, n_channels)}")
+            _check_order(section, known[section.grid], place)
+        yield part
 
 
 def _channels(grid: Grid, n_channels: int) -> int:

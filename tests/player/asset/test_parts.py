@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 import shutil
 import tracemalloc
 from collections.abc import Callable
@@ -162,6 +163,48 @@ def test_a_later_part_that_is_broken_is_told_and_the_others_play(
     assert cli.main([str(broken), "--info"]) == 0
     said = capsys.readouterr().err
     assert said == f"vfr-play: warning: {asset.missing}\n"
+
+
+def exchange_parts(m: dict[str, Any]) -> None:
+    m["parts"][1], m["parts"][2] = m["parts"][2], m["parts"][1]
+
+
+def exchange_sections(m: dict[str, Any]) -> None:
+    one, other = m["parts"][1], m["parts"][2]
+    one["sections"], other["sections"] = other["sections"], one["sections"]
+
+
+def lengthen(m: dict[str, Any]) -> None:
+    m["parts"][1]["sections"][-1]["bytes"] += 1
+
+
+def repeat(m: dict[str, Any]) -> None:
+    m["parts"].insert(1, m["parts"][0])
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (exchange_parts, r"parts: 1: file: expected part_1\.bin, got part_2\.bin"),
+        (exchange_sections, "parts: 1: .* expected .* before it"),
+        (lengthen, r"files: part_1\.bin: bytes: expected"),
+        (repeat, r"parts: 1: file: expected part_1\.bin, got part_0\.bin"),
+    ],
+)
+def test_what_comes_before_a_part_that_is_not_in_its_place_plays(
+    change: Callable[[dict[str, Any]], None], message: str, broken: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    wanted = Asset.open(broken, parts=1)
+    edit(broken, change)
+    asset = Asset.open(broken)
+    assert asset.n_parts == 1 and asset.missing is not None and "\n" not in asset.missing
+    assert re.search(rf"broken.manifest\.json: {message}.*: shown as the first 1 of \d parts", asset.missing)
+    assert same(asset.arrays.features, wanted.arrays.features)
+    assert [grown.n_parts for grown in Asset.growing(broken)] == [1, 1]
+    with pytest.raises(FormatError, match=message):
+        Asset.open(broken, verify=True)
+    assert cli.main([str(broken), "--info"]) == 0
+    assert capsys.readouterr().err == f"vfr-play: warning: {asset.missing}\n"
 
 
 @pytest.mark.parametrize("do", BROKEN)
