@@ -51,7 +51,9 @@ def write_video(path: Path, pictures: Iterable[np.ndarray], fps: float, key: str
     av = load_av()
     with new_file(path) as temporary:
         try:
-            with av.open(str(temporary), "w", options={"movflags": "faststart"}) as container:
+            # FFmpeg takes what is before a colon in a relative name for a protocol.
+            name = str(temporary.absolute())
+            with av.open(name, "w", options={"movflags": "faststart"}) as container:
                 container.metadata["comment"] = f"{KEY}={key}"
                 _encode(av, container, pictures, fps)
         except (av.FFmpegError, OSError) as error:

@@ -55,16 +55,24 @@ def extract_frames(video: Path, progress: Progress, say: Callable[[str], object]
     looked at and to look at. `say`: called with a sentence if many frames cannot be read. The folder appears
     when it is complete; one that was made before is used as it is. Returns the folder.
 
-    Raises DataError (not a video, no frames, a folder with the frames of another video), OutputError,
-    MissingExtraError.
+    Raises DataError (not a video, no frames, a name that is not Unicode, a folder with the frames of another
+    video), OutputError, MissingExtraError.
     """
     folder = frames_folder(video)
     if (folder / "images").is_dir():
         check_source(folder, video)
         return folder
     cv2 = opencv(f"{video}: video: expected OpenCV to read it")
+    # FFmpeg takes what is before a colon in a relative name for a protocol.
+    name = str(video.absolute())
+    try:
+        name.encode()  # OpenCV crashes at other names
+    except UnicodeEncodeError:
+        raise DataError(
+            f"{name!a}: expected a name in UTF-8: give the video or its folder another one"
+        ) from None
     # OpenCV turns the frames upright where the file says how the camera was held.
-    capture = cv2.VideoCapture(str(video))
+    capture = cv2.VideoCapture(name)
     try:
         # The count in a video's header is a guess, and some videos have none.
         n_frames = int(capture.get(cv2.CAP_PROP_FRAME_COUNT)) if capture.isOpened() else 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from fractions import Fraction
 from pathlib import Path
 from types import SimpleNamespace
@@ -223,6 +224,28 @@ def test_a_file_that_is_no_video(tmp_path: Path, capfd: pytest.CaptureFixture[st
     path.write_bytes(b"no video" * 100)
     assert message(path) == f"{path}: video: expected one that OpenCV can read, with frames in it"
     assert not video.frames_folder(path).exists()
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows has no such names")
+def test_a_relative_name_with_a_colon(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    with av.open(str(tmp_path / "12-30.mp4"), "w") as container:
+        stream = container.add_stream("libx264", rate=10)
+        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
+        container.mux(stream.encode(av.VideoFrame(64, 48, "yuv420p")))
+        container.mux(stream.encode())
+    (tmp_path / "12-30.mp4").rename(tmp_path / "12:30.mp4")
+    monkeypatch.chdir(tmp_path)
+    folder = video.extract_frames(Path("12:30.mp4"), lambda done, of: None)
+    assert folder == Path("12:30_frames") and len([*(folder / "images").iterdir()]) == 1
+
+
+def test_a_name_that_is_no_text(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """OpenCV ends the process at a file name that is not UTF-8."""
+    monkeypatch.setattr(cv2, "VideoCapture", lambda name: pytest.fail("the file is opened"))
+    for path in (tmp_path / "wal\udce8k.mp4", tmp_path / "M\udcfcnchen" / "walk.mp4"):
+        with pytest.raises(DataError, match="expected a name in UTF-8") as caught:
+            video.extract_frames(path, quiet_frames)
+        assert str(caught.value).isascii()
 
 
 def test_a_video_without_frames(tmp_path: Path):
