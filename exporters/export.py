@@ -217,7 +217,7 @@ def _check_target(asset_path: Path, target: Path, name: str, force: bool) -> boo
     elif target.exists() and target.is_dir() != is_folder:
         wanted, there = ("folder", "file") if is_folder else ("file", "folder")
         raise OutputError(f"{target}: expected the name of a {wanted}, got a {there}")
-    if target.exists() and target.resolve().parent == asset_path.resolve():
-        raise OutputError(f"{target}: is part of the asset: expected a place outside {asset_path}")
+    if asset_path.resolve() in (target.resolve(), *target.resolve().parents):
+        raise OutputError(f"{target}: expected a place outside the asset {asset_path}, got one inside")
     check_target(target, force)
     return force

@@ -180,8 +180,9 @@ def test_bounds_far_from_the_origin(tmp_path: Path, capsys: pytest.CaptureFixtur
 
 
 def test_an_empty_folder_is_no_asset(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main([str(tmp_path), str(tmp_path / "mesh.glb")]) == 1
-    assert str(tmp_path) in capsys.readouterr().err
+    (tmp_path / "empty").mkdir()
+    assert cli.main([str(tmp_path / "empty"), str(tmp_path / "mesh.glb")]) == 1
+    assert f"{tmp_path / 'empty'}: " in capsys.readouterr().err
 
 
 def test_interrupted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

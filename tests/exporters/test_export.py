@@ -251,11 +251,18 @@ def test_an_earlier_export_is_replaced(
     assert any(after[name] != before[name] for name in after)
 
 
-def test_the_asset_is_not_overwritten(shells_asset: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    for name in ("mesh.ply", "head.onnx", "cameras.json"):
-        assert "is part of the asset" in fails(
-            [str(shells_asset), str(shells_asset / name), "--force"], capsys
-        )
+@pytest.mark.parametrize("force", [[], ["--force"]])
+def test_nothing_is_written_into_the_asset(
+    force: list[str], shells_asset: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Neither its own files nor new ones, with which `vfr-bake --force` would refuse to replace it."""
+    before = sorted(shells_asset.rglob("*"))
+    for name in ("mesh.ply", "head.onnx", "cameras.json", "new.stl", "new/new.stl"):
+        error = fails([str(shells_asset), str(shells_asset / name), *force], capsys)
+        assert f"{name}: expected a place outside the asset {shells_asset}, got one inside" in error
+    for folder in (shells_asset, shells_asset / "new"):
+        assert fails([str(shells_asset), str(folder), "--format", "exr", *force], capsys)
+    assert sorted(shells_asset.rglob("*")) == before
     Asset.open(shells_asset, verify=True)
 
 
