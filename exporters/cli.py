@@ -55,7 +55,7 @@ pages:
 
 cameras:
   vfr-export out/ cameras.json --frame gltf          transforms.json, turned as the mesh is
-  vfr-export out/ sparse/ --format colmap            for Gaussian splatting, MVS
+  vfr-export out/ sparse/ --format colmap            for Gaussian splatting
 
 pictures:
   vfr-export out/ frames/ --format exr --cameras transforms_test.json

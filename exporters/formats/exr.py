@@ -17,7 +17,7 @@ opacity is over 1/512, as for the player. In other pixels Z and distance are inf
 opacity and samples is 0.
 
 A name has one dot between the layer and a channel of one letter, so that Blender, Nuke and OpenImageIO group
-the channels of a layer; the channels of the features have numbers.
+the channels of a layer. The channels of the features have numbers, and Blender leaves them out.
 """
 
 from __future__ import annotations
@@ -103,6 +103,9 @@ def exr_header(camera: Camera, places: bool = True) -> dict[str, Any]:
     pixel centres at +0.5. OpenEXR's own are in float32: without `places` (see `exr_channels`) they are left
     out.
 
+    `screenWindowCenter` and `screenWindowWidth` are the middle and the width of the picture on the plane one
+    unit ahead of the camera. There x is LEFT, and y up (OpenEXR's Technical Introduction).
+
     >>> header = exr_header(Camera("a", np.eye(4), 4, 2, 3.0, 3.0, 2.0, 1.0))
     >>> bool(np.allclose(np.array([0, 0, -5.0, 1]) @ header["worldToNDC"], [2.5, 2.5, 1, 5]))
     True
@@ -123,6 +126,14 @@ def exr_header(camera: Camera, places: bool = True) -> dict[str, Any]:
     return {
         "chromaticities": REC709,
         "software": SOFTWARE,
+        "screenWindowWidth": camera.width / camera.fx,
+        "screenWindowCenter": np.array(
+            [
+                (camera.cx - camera.width / 2) / camera.fx,
+                (camera.cy - camera.height / 2) / camera.fy,
+            ],
+            np.float32,
+        ),
         **(matrices if places else {}),
         "vfr.camera": camera.name,
         "vfr.cameraToWorld": np.ascontiguousarray(camera.c2w, np.float64),

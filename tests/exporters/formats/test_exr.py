@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -111,6 +112,24 @@ def test_header_projects_positions_onto_their_pixels(frame: Frame, camera: Camer
     np.testing.assert_allclose(camera.cy - camera.fy * y, rows + 0.5, rtol=0, atol=1e-3)
     assert np.array_equal(header["vfr.cameraToWorld"], camera.c2w)
     assert header["vfr.intrinsics"][0].tolist() == [camera.fx, 0, camera.cx]
+
+
+def test_the_screen_window_is_the_picture(frame: Frame, camera: Camera, tmp_path: Path) -> None:
+    """The screen window lies on the plane z = 1 of a camera that looks along +z with x to the left and y up:
+    its corners are the directions through the corners of the picture."""
+    camera = replace(camera, cx=camera.cx + 3, cy=camera.cy + 5)
+    path = tmp_path / "a.exr"
+    write_exr(path, exr_channels(frame, camera), exr_header(camera))
+    with OpenEXR.File(str(path)) as file:
+        header = dict(file.header())
+    width, (x, y) = header["screenWindowWidth"], header["screenWindowCenter"]
+    height = width * 40 / 48  # the pixels are square
+    left, right = x + width / 2, x - width / 2
+    upper, lower = y + height / 2, y - height / 2
+    edges = [camera.cx / camera.fx, (camera.cx - 48) / camera.fx]
+    np.testing.assert_allclose([left, right], edges, rtol=0, atol=1e-6)
+    edges = [camera.cy / camera.fy, (camera.cy - 40) / camera.fy]
+    np.testing.assert_allclose([upper, lower], edges, rtol=0, atol=1e-6)
 
 
 def test_folder_of_pictures(shells_asset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
