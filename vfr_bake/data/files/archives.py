@@ -11,6 +11,9 @@ import stat
 import zipfile
 import zlib
 from collections import Counter
+from collections.abc import Iterator
+from functools import partial
+from lzma import LZMAError
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
 from player.errors import DataError, OutputError
@@ -32,6 +35,8 @@ MOST_OF_ONE = 1 << 30
 MOST_TIMES, SPARED = 50, 64 << 20
 """The unpacked files may take at most MOST_TIMES the bytes of the ZIP and SPARED bytes more: pictures are
 compressed already, and hardly grow."""
+PIECE = 1 << 20
+"""Bytes that are unpacked at a time."""
 FREE = 0.9
 """Largest share of the free disk that is used."""
 _DAMAGED = (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError, UnicodeError)
@@ -160,8 +165,18 @@ def _decoded(entry: zipfile.ZipInfo) -> str:
 def _unpack_one(file: zipfile.ZipFile, entry: zipfile.ZipInfo, target: Path) -> None:
     """Unpack an entry to `target`; `zipfile` ends it at the size that its directory states."""
     target.parent.mkdir(parents=True, exist_ok=True)
-    with file.open(entry) as source, target.open("xb") as copy:
-        shutil.copyfileobj(source, copy)
+    with target.open("xb") as copy:
+        copy.writelines(_content(file, entry))
+
+
+def _content(file: zipfile.ZipFile, entry: zipfile.ZipInfo) -> Iterator[bytes]:
+    """Yield the content of an entry piece by piece. Raises BadZipFile for errors of the system, of bzip2 and
+    of LZMA, too, which could not be told from those of writing."""
+    try:
+        with file.open(entry) as source:
+            yield from iter(partial(source.read, PIECE), b"")
+    except (OSError, ValueError, LZMAError) as error:
+        raise zipfile.BadZipFile(getattr(error, "strerror", None) or str(error)) from error
 
 
 def _inner(folder: Path) -> Path:

@@ -6,6 +6,7 @@ import io
 import stat
 import zipfile
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -135,6 +136,18 @@ def damaged(path: Path) -> None:
     path.write_bytes(data)
 
 
+def with_damaged(compression: int, path: Path) -> None:
+    """Damage the middle of what an entry is packed to."""
+    content = np.random.default_rng(0).bytes(5000)
+    data = bytearray(pack(path, {"a.png": content}, compression).read_bytes())
+    data[2000:2500] = bytes(500)
+    path.write_bytes(data)
+
+
+def without_its_beginning(path: Path) -> None:
+    path.write_bytes(pack(path, {"a.png": bytes(5000)}).read_bytes()[20:])
+
+
 @pytest.mark.parametrize(
     ("make", "expected"),
     [
@@ -155,6 +168,10 @@ def damaged(path: Path) -> None:
         (cut_short, "cannot be read to its end"),
         (with_a_name_that_is_no_utf8, "cannot be read to its end: 'utf-8' codec"),
         (damaged, "cannot be read to its end"),
+        (partial(with_damaged, zipfile.ZIP_DEFLATED), "cannot be read to its end"),
+        (partial(with_damaged, zipfile.ZIP_BZIP2), "cannot be read to its end"),
+        (partial(with_damaged, zipfile.ZIP_LZMA), "cannot be read to its end"),
+        (without_its_beginning, "cannot be read to its end"),
         (lambda path: path.write_bytes(b"no zip"), "cannot be read to its end"),
     ],
 )
