@@ -200,7 +200,7 @@ class _Bake:
             write_asset(folder, manifest, arrays, head, b"", cameras, force, finish)
         last = self.held_out.stages[-1]
         figures |= {"psnr_to_full_model": last.psnr, "loss_db": last.loss.db, "time": self.seconds}
-        figures |= {"loss_db_spread": last.loss.spread}
+        figures |= {"loss_db_spread": last.loss.stated}
         figures |= {"stages": self.held_out.table(), "left_out": self.left_out}
         n_bytes, seconds = sum(file_sizes(folder).values()), sum(self.seconds.values())
         return BakeResult(figures["n_vertices"], n_bytes, seconds, last.loss, figures, missed)

@@ -356,7 +356,7 @@ class HeldOut:
                 "name": stage.name,
                 "psnr": stage.psnr,
                 "loss_db": stage.loss.db,
-                "loss_db_spread": stage.loss.spread,
+                "loss_db_spread": stage.loss.stated,
                 "samples_median": stage.samples_median,
                 "samples_p95": stage.samples_p95,
             }

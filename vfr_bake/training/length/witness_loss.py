@@ -27,6 +27,9 @@ PATCH_WEIGHT = 1 / 2
 BLOCKS_OF_A_VIEW = 16
 """Number of runs of rows into which the witnesses of a view are split for the jackknife, if it is the only
 one with patches, or the only whole one."""
+T_FACTORS = {2: 1.84, 3: 1.32, 4: 1.20}
+"""Number of standard errors, by the number of views from which they are estimated, within which a mean lies
+as often as within one that is known exactly: Student's t distribution."""
 
 
 class Loss(NamedTuple):
@@ -36,6 +39,14 @@ class Loss(NamedTuple):
     """Loss in dB; less than 0 if they are better."""
     spread: float | None
     """Standard error in dB; None if the loss is not measured but expected."""
+    widening: float = 0.0
+    """dB by which the standard error is stated wider, because some of it is estimated from few views. Choices
+    do not take it into account."""
+
+    @property
+    def stated(self) -> float | None:
+        """The standard error in dB as it is stated; None if the loss is not measured but expected."""
+        return None if self.spread is None else self.spread + self.widening
 
     @property
     def most(self) -> float:
@@ -53,9 +64,9 @@ class Loss(NamedTuple):
         return self.db - (self.spread or 0.0)
 
     def __str__(self) -> str:
-        if self.spread is None:
+        if self.stated is None:
             return f"an expected {self.db:.2f} dB"
-        return f"{self.db:.2f} dB (give or take {self.spread:.2f})"
+        return f"{self.db:.2f} dB (give or take {self.stated:.2f})"
 
 
 class WitnessLoss:
@@ -93,14 +104,18 @@ class WitnessLoss:
         """Return the loss of the errors `after` [n_witnesses], compared with the errors `before`.
 
         The spread is found by a jackknife: every view (or every part of the only view of a kind) is left out
-        once. Whole views and not pixels are left out, because errors within a view are correlated.
+        once. Whole views and not pixels are left out, because errors within a view are correlated. What is
+        estimated from few views is stated wider by T_FACTORS.
         """
-        db, variance = 0.0, 0.0
+        db, variance, stated = 0.0, 0.0, 0.0
         for (lost, without), weight in zip(self._of_kinds(before, after), self._weights, strict=True):
             db += weight * lost
             changes = weight * (without - without.mean())
-            variance += (len(changes) - 1) / len(changes) * float((changes**2).sum())
-        return Loss(db, float(np.sqrt(variance)))
+            of_kind = (len(changes) - 1) / len(changes) * float((changes**2).sum())
+            variance += of_kind
+            stated += of_kind * T_FACTORS.get(len(changes), 1.0) ** 2
+        spread = float(np.sqrt(variance))
+        return Loss(db, spread, float(np.sqrt(stated)) - spread)
 
     def _of_kinds(self, before: np.ndarray, after: np.ndarray) -> list[tuple[float, np.ndarray]]:
         """Return, for each kind of witness, its loss in dB and the losses [n_blocks] without each block."""

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from vfr_bake.data.witnesses import Witnesses
-from vfr_bake.training.length.witness_loss import BLOCKS_OF_A_VIEW, PATCH_WEIGHT, Loss, WitnessLoss
+from vfr_bake.training.length.witness_loss import BLOCKS_OF_A_VIEW, PATCH_WEIGHT, T_FACTORS, Loss, WitnessLoss
 
 WHITE = np.ones(3, np.float32)
 
@@ -111,11 +111,11 @@ def test_errors_are_between_8_bit_pictures_over_the_background() -> None:
 def test_no_change_is_no_loss_and_a_better_picture_loses_less_than_nothing() -> None:
     measured = WitnessLoss(some_witnesses([50, 60, 70], []), WHITE)
     errors = np.random.default_rng(3).exponential(0.01, 180)
-    assert measured.loss(errors, errors) == (0.0, 0.0)
+    assert measured.loss(errors, errors) == (0.0, 0.0, 0.0)
     found = measured.loss(errors, errors / 2)
     assert found.db == pytest.approx(-10 * math.log10(2)) and found.spread == pytest.approx(0, abs=1e-9)
     nothing = np.zeros(180)
-    assert measured.loss(nothing, nothing) == (0.0, 0.0)
+    assert measured.loss(nothing, nothing) == (0.0, 0.0, 0.0)
     assert math.isfinite(measured.loss(nothing, errors).db)
 
 
@@ -136,6 +136,29 @@ def test_the_spread_is_as_large_as_the_losses_of_other_witnesses_differ() -> Non
     assert np.mean(spreads) == pytest.approx(np.std(losses), rel=0.12)
 
 
+@pytest.mark.parametrize("n_views", [2, 3, 4])
+def test_a_loss_lies_within_the_stated_spread_as_often_as_within_a_standard_error(n_views: int) -> None:
+    """The losses of the views are normal, so that their mean over its estimated standard error has Student's
+    t distribution with one degree of freedom less than there are views."""
+    cumulative = {
+        2: lambda t: math.atan(t) / math.pi,
+        3: lambda t: t / (2 * math.sqrt(2 + t**2)),
+        4: lambda t: (t / math.sqrt(3) / (1 + t**2 / 3) + math.atan(t / math.sqrt(3))) / math.pi,
+    }
+    within = math.erf(1 / math.sqrt(2))
+    assert 2 * cumulative[n_views](T_FACTORS[n_views]) == pytest.approx(within, abs=2e-3)
+    measured = WitnessLoss(some_witnesses([5] * n_views, list(range(n_views))), WHITE)
+    views = np.repeat(np.arange(n_views), 5)
+    random = np.random.default_rng(6)
+    ones, hits = np.ones(len(views)), []
+    for _ in range(2000):
+        found = measured.loss(ones, 10 ** (random.normal(0, 0.02, n_views)[views]))
+        assert found.stated is not None
+        hits.append(abs(found.db) <= found.stated)
+    # A share of 2000 draws is known to 0.01.
+    assert np.mean(hits) == pytest.approx(within, abs=0.03)
+
+
 def test_a_single_view_has_a_spread() -> None:
     measured = WitnessLoss(some_witnesses([48], []), WHITE)
     before, after = np.random.default_rng(5).exponential(0.01, (2, 48))
@@ -145,4 +168,6 @@ def test_a_single_view_has_a_spread() -> None:
 
 def test_a_loss_in_words() -> None:
     assert str(Loss(0.1234, 0.02)) == "0.12 dB (give or take 0.02)"
+    assert str(Loss(0.1234, 0.02, 0.01)) == "0.12 dB (give or take 0.03)"
+    assert Loss(0.1234, 0.02, 0.01).most == 0.1234 + 0.02, "choices do not depend on what is stated"
     assert str(Loss(0.1234, None)) == "an expected 0.12 dB" and Loss(0.5, None).most == 0.5
