@@ -1,9 +1,7 @@
-"""Writer of a COLMAP model, for Gaussian splatting and multi-view stereo.
+"""Writer of a COLMAP model, for Gaussian splatting.
 
-The files are text (`cameras.txt`, `images.txt`, `points3D.txt`). If the name of a picture has white space, or
-there are more than MAX_TEXT_POINTS points, they are binary (`cameras.bin`, `images.bin`, `points3D.bin`) with
-the same content: readers of the text end a name at its first space, while in binary form a name ends with a
-zero byte, and text of many points takes much memory and time.
+The files are COLMAP's binary form, `cameras.bin`, `images.bin` and `points3D.bin`. Not every program reads
+COLMAP's text, whose readers also end the name of a picture at its first space.
 
 A COLMAP camera looks along +z with y down (OpenCV). A picture's pose is the transform camera from world, as a
 quaternion (w, x, y, z) and a translation. Pixel centres are at +0.5, as in this project. Pictures have no
@@ -14,7 +12,6 @@ their ERROR is 0.
 from __future__ import annotations
 
 import struct
-import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
@@ -28,18 +25,9 @@ from player.cameras.camera import Camera
 from player.cameras.colmap import MAX_FILE_BYTES
 from player.cameras.rotations import OPENGL_FROM_OPENCV, quaternion, rotation_matrix
 from player.errors import FormatError, ParityError
-from player.files.files import open_file, read_bytes
+from player.files.files import read_bytes
 
-TEXT_FILES = ("cameras.txt", "images.txt", "points3D.txt")
-BINARY_FILES = ("cameras.bin", "images.bin", "points3D.bin")
-_HEADS = (
-    "# CAMERA_ID, MODEL, WIDTH, HEIGHT, fx, fy, cx, cy",
-    "# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME, then a line of keypoints (none)",
-    "# POINT3D_ID, X, Y, Z, R, G, B, ERROR, then its track (none)",
-)
-"""The first lines of the text files."""
-MAX_TEXT_POINTS = 1_000_000
-"""Most points of a text model. While text is made, a point takes 430 bytes of memory, in binary form 103."""
+FILES = ("cameras.bin", "images.bin", "points3D.bin")
 TOLERANCE = 1e-9
 """Largest relative difference of a camera read back: poses go through a quaternion and back, in float64."""
 
@@ -92,36 +80,23 @@ def colmap_files(cameras: Sequence[Camera], cloud: TriangleMesh) -> dict[str, by
     >>> none = np.zeros((0, 3))
     >>> empty = TriangleMesh(none, np.zeros((0, 3), np.int32), none, np.zeros((0, 4), np.uint8))
     >>> camera = Camera("./a.png", np.eye(4), 4, 3, 5.0, 5.0, 2.0, 1.5)
-    >>> colmap_files([camera], empty)["images.txt"].decode().splitlines()[-2]
-    '1 0.0 1.0 0.0 0.0 0.0 0.0 0.0 1 a.png'
-    >>> list(colmap_files([replace(camera, name="IMG 0001.jpg")], empty))
+    >>> list(colmap_files([camera], empty))
     ['cameras.bin', 'images.bin', 'points3D.bin']
     """
-    model = _model(cameras, cloud)
-    has_space = any(character.isspace() for image in model.images for character in image.name)
-    if has_space or len(model.places) > MAX_TEXT_POINTS:
-        files = _binary_files(model)
-        _check(_parse_binary(files), cameras, cloud, BINARY_FILES)
-    else:
-        files = _text_files(model)
-        _check(_parse_text(files), cameras, cloud, TEXT_FILES)
+    files = _written(_model(cameras, cloud))
+    _check(_parsed(files), cameras, cloud)
     return files
 
 
 def is_model_file(path: Path) -> bool:
     """Return whether a file is one of a model that was written here.
 
-    The text files begin with their own lines. Binary files have no room for a mark: they count as written
-    here if they have what this writer gives them, numbers 1, 2, ..., pinhole cameras, pictures without
-    keypoints, and points without tracks or errors.
+    The files have no room for a mark: they count as written here if they have what this writer gives them,
+    numbers 1, 2, ..., pinhole cameras, pictures without keypoints, and points without tracks or errors.
     """
+    if path.name not in FILES:
+        return False
     try:
-        if path.name in TEXT_FILES:
-            head = _HEADS[TEXT_FILES.index(path.name)].encode() + b"\n"
-            with open_file(path, "a COLMAP model", sys.maxsize) as file:
-                return file.read(len(head)) == head
-        if path.name not in BINARY_FILES:
-            return False
         data = read_bytes(path, "a COLMAP model", MAX_FILE_BYTES)
     except FormatError:  # a folder, or not readable
         return False
@@ -136,7 +111,7 @@ def is_model_file(path: Path) -> bool:
 
 
 def _has_no_keypoints(data: bytes) -> bool:
-    """Return whether the content of an `images.bin` is as `_binary_files` writes it."""
+    """Return whether the content of an `images.bin` is as `_written` has it."""
     try:
         at = _COUNT.size
         (n_images,) = _COUNT.unpack_from(data)
@@ -176,46 +151,7 @@ def _name(camera: Camera) -> str:
     return name if PurePosixPath(name).suffix else f"{name}.png"
 
 
-def _text_files(model: _Model) -> dict[str, bytes]:
-    lenses = [f"{i} PINHOLE {lens[0]} {lens[1]} {_numbers(lens[2:])}" for i, lens in model.lenses.items()]
-    images = []
-    for number, image in enumerate(model.images, start=1):
-        images += [f"{number} {_numbers(image.pose)} {image.lens} {image.name}", ""]
-    points = [
-        f"{number} {_numbers(place)} {red} {green} {blue} 0"
-        for number, (place, (red, green, blue)) in enumerate(
-            zip(model.places.tolist(), model.colours.tolist(), strict=True), start=1
-        )
-    ]
-    return {
-        name: ("\n".join([head, *lines]) + "\n").encode()
-        for name, head, lines in zip(TEXT_FILES, _HEADS, (lenses, images, points), strict=True)
-    }
-
-
-def _numbers(values: Sequence[float]) -> str:
-    return " ".join(repr(float(value) + 0.0) for value in values)
-
-
-def _parse_text(files: dict[str, bytes]) -> _Model:
-    cameras_file, images_file, points_file = TEXT_FILES
-    heads, pictures = (
-        [line for line in files[name].decode().split("\n")[1:-1] if line]
-        for name in (cameras_file, images_file)
-    )
-    lenses: dict[int, tuple[float, ...]] = {}
-    for line in heads:
-        number, _, width, height, *parameters = line.split()
-        lenses[int(number)] = (int(width), int(height), *map(float, parameters))
-    images = []
-    for line in pictures:
-        words = line.split(" ", 9)
-        images.append(_Image([float(word) for word in words[1:8]], int(words[8]), words[9]))
-    rows = np.fromstring(files[points_file].decode().split("\n", 1)[1], sep=" ").reshape(-1, 8)
-    return _Model(lenses, images, rows[:, 1:4], rows[:, 4:7])
-
-
-def _binary_files(model: _Model) -> dict[str, bytes]:
+def _written(model: _Model) -> dict[str, bytes]:
     lenses = np.zeros(len(model.lenses), _LENS)
     numbers = np.array(list(model.lenses.values()), np.float64)
     lenses["id"], lenses["model"] = list(model.lenses), _PINHOLE
@@ -227,7 +163,7 @@ def _binary_files(model: _Model) -> dict[str, bytes]:
     points = np.zeros(len(model.places), _POINT)
     points["id"] = np.arange(1, len(points) + 1)
     points["place"], points["colour"] = model.places, model.colours
-    cameras_file, images_file, points_file = BINARY_FILES
+    cameras_file, images_file, points_file = FILES
     return {
         cameras_file: _COUNT.pack(len(lenses)) + lenses.tobytes(),
         images_file: _COUNT.pack(len(images)) + b"".join(images),
@@ -235,8 +171,8 @@ def _binary_files(model: _Model) -> dict[str, bytes]:
     }
 
 
-def _parse_binary(files: dict[str, bytes]) -> _Model:
-    lens_data, image_data, point_data = (files[name] for name in BINARY_FILES)
+def _parsed(files: dict[str, bytes]) -> _Model:
+    lens_data, image_data, point_data = (files[name] for name in FILES)
     n_lenses, n_images, n_points = (
         _COUNT.unpack_from(data)[0] for data in (lens_data, image_data, point_data)
     )
@@ -255,9 +191,8 @@ def _parse_binary(files: dict[str, bytes]) -> _Model:
     return _Model(lenses, images, points["place"], points["colour"])
 
 
-def _check(read: _Model, cameras: Sequence[Camera], cloud: TriangleMesh, names: Sequence[str]) -> None:
-    """Raise ParityError unless the model that was read back holds the cameras and the points; `names` are
-    those of the three files."""
+def _check(read: _Model, cameras: Sequence[Camera], cloud: TriangleMesh) -> None:
+    """Raise ParityError unless the model that was read back holds the cameras and the points."""
     found = []
     for image in read.images:
         w2c = np.eye(4)
@@ -266,8 +201,8 @@ def _check(read: _Model, cameras: Sequence[Camera], cloud: TriangleMesh, names: 
         width, height, *lens = read.lenses[image.lens]
         c2w = np.linalg.inv(w2c) @ OPENGL_FROM_OPENCV
         found.append(Camera(image.name, c2w, int(width), int(height), *lens))
-    check_cameras([_rigid(camera) for camera in cameras], found, names[1], TOLERANCE)
+    check_cameras([_rigid(camera) for camera in cameras], found, FILES[1], TOLERANCE)
     expected = (cloud.vertices, cloud.colours[:, :3])
     if not all(map(np.array_equal, expected, (read.places, read.colours))):
         n_expected, n_read = len(cloud.vertices), len(read.places)
-        raise ParityError(f"{names[2]}: expected {n_expected} points as sampled, got {n_read} others")
+        raise ParityError(f"{FILES[2]}: expected {n_expected} points as sampled, got {n_read} others")

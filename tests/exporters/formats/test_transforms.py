@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tracemalloc
 import warnings
 from dataclasses import replace
 from pathlib import Path
@@ -13,12 +12,13 @@ import pytest
 from exporters import cli, export
 from exporters.formats import colmap
 from exporters.formats.axes import COORDINATES, coordinates_from_world
-from exporters.formats.colmap import BINARY_FILES, TEXT_FILES, colmap_files
+from exporters.formats.colmap import FILES, colmap_files
 from exporters.formats.points import sample_points
 from exporters.formats.transforms import check_cameras, moved_cameras, transforms_bytes
 from player.asset.asset import Asset
 from player.cameras.camera import Camera
-from player.cameras.colmap import read_images, read_points, read_views
+from player.cameras.colmap import Lens, read_images, read_points, read_views
+from player.cameras.colmap import read_cameras as read_lenses
 from player.cameras.rotations import quaternion, rotation_matrix
 from player.cameras.transforms import read_cameras
 from player.errors import ParityError
@@ -81,8 +81,7 @@ def test_pycolmap_reads_the_model(
     arguments += ["--method", "baked"]
     assert cli.main(arguments) == 0
     assert "5 cameras, 50 points" in capsys.readouterr().out
-    names = BINARY_FILES if " " in first else TEXT_FILES
-    assert sorted(path.name for path in target.iterdir()) == sorted(names)
+    assert sorted(path.name for path in target.iterdir()) == sorted(FILES)
     model = pycolmap.Reconstruction(str(target))
     assert model.num_images() == 5 and model.num_cameras() == 1 and model.num_points3D() == 50
     world = sample_points(box(*BOX), 50).vertices
@@ -108,31 +107,36 @@ def test_quaternions_survive() -> None:
         np.testing.assert_allclose(rotation_matrix(q), turn, rtol=0, atol=1e-12)
 
 
-def test_lenses_are_shared() -> None:
+def written(folder: Path, cameras: list[Camera]) -> dict[str, bytes]:
+    """Write the files of the cameras and a box, and return their contents."""
+    files = colmap_files(cameras, box((0, 0, 0), (1, 1, 1)))
+    for file, data in files.items():
+        (folder / file).write_bytes(data)
+    return files
+
+
+def test_lenses_are_shared(tmp_path: Path) -> None:
     camera = Camera("./pictures/a.png", np.eye(4), 4, 3, 5.0, 5.5, 2.0, 1.5)
     other = camera.resized(8, 6)
-    files = colmap_files([camera, other, camera], box((0, 0, 0), (1, 1, 1)))
-    assert files["cameras.txt"].decode().splitlines()[1:] == [
-        "1 PINHOLE 4 3 5.0 5.5 2.0 1.5",
-        "2 PINHOLE 8 6 10.0 11.0 4.0 3.0",
+    files = written(tmp_path, [camera, other, camera])
+    assert read_lenses(tmp_path / "cameras.bin") == {
+        1: Lens(4, 3, 5.0, 5.5, 2.0, 1.5, {}),
+        2: Lens(8, 6, 10.0, 11.0, 4.0, 3.0, {}),
+    }
+    assert [(image.camera_id, image.name) for image in read_images(tmp_path / "images.bin")] == [
+        (number, "pictures/a.png") for number in (1, 2, 1)
     ]
-    images = files["images.txt"].decode().splitlines()
-    assert [line.split(" ", 8)[8] for line in images[1::2]] == [
-        f"{number} pictures/a.png" for number in (1, 2, 1)
-    ]
-    assert files == colmap_files([camera, other, camera], box((0, 0, 0), (1, 1, 1)))
+    assert files == written(tmp_path, [camera, other, camera])
 
 
 @pytest.mark.parametrize("name", ["a b.png", "my pictures/a.png", "9.41\u202fAM.png"])
-def test_names_with_white_space_make_binary_files(name: str, tmp_path: Path) -> None:
+def test_names_with_white_space_are_kept(name: str, tmp_path: Path) -> None:
     """The player's reader finds the names and cameras in the binary files; the numbers of bytes are COLMAP's:
     56 a camera, 73 and the name a picture, 51 a point."""
     camera = Camera(f"./{name}", np.eye(4), 4, 3, 5.0, 5.5, 2.0, 1.5)
     other = replace(camera.resized(8, 6), name="a.png")
-    files = colmap_files([camera, other, camera], box((0, 0, 0), (1, 1, 1)))
-    assert tuple(files) == BINARY_FILES
-    for file, data in files.items():
-        (tmp_path / file).write_bytes(data)
+    files = written(tmp_path, [camera, other, camera])
+    assert tuple(files) == FILES
     assert [(image.name, image.camera_id) for image in read_images(tmp_path / "images.bin")] == [
         (name, 1), ("a.png", 2), (name, 1)
     ]  # fmt: skip
@@ -145,32 +149,12 @@ def test_names_with_white_space_make_binary_files(name: str, tmp_path: Path) -> 
     ]  # fmt: skip
 
 
-def test_names_without_a_suffix_are_those_of_png_files() -> None:
+def test_names_without_a_suffix_are_those_of_png_files(tmp_path: Path) -> None:
     camera = Camera("./train/r_0", np.eye(4), 4, 3, 5.0, 5.5, 2.0, 1.5)
     cameras = [camera, replace(camera, name="a.JPG"), replace(camera, name="v1.2\\b")]
-    lines = colmap_files(cameras, box((0, 0, 0), (1, 1, 1)))["images.txt"].decode().splitlines()[1::2]
-    assert [line.split(" ", 9)[9] for line in lines] == ["train/r_0.png", "a.JPG", "v1.2/b.png"]
-
-
-def test_many_points_make_binary_files(monkeypatch: pytest.MonkeyPatch) -> None:
-    camera, corners = Camera("a.png", np.eye(4), 4, 3, 5.0, 5.5, 2.0, 1.5), box((0, 0, 0), (1, 1, 1))
-    monkeypatch.setattr(colmap, "MAX_TEXT_POINTS", 8)
-    assert tuple(colmap_files([camera], corners)) == TEXT_FILES
-    monkeypatch.setattr(colmap, "MAX_TEXT_POINTS", 7)
-    assert tuple(colmap_files([camera], corners)) == BINARY_FILES
-
-
-def test_text_of_points_is_read_back_in_little_memory() -> None:
-    """Reading takes the text twice and the numbers, 64 bytes a point; words or lines of their own would take
-    several hundred."""
-    points = sample_points(box((0, 0, 0), (1, 1, 1)), 20_000)
-    files = colmap_files([Camera("a.png", np.eye(4), 4, 3, 5.0, 5.5, 2.0, 1.5)], points)
-    tracemalloc.start()
-    model = colmap._parse_text(files)
-    _, most = tracemalloc.get_traced_memory()
-    tracemalloc.stop()
-    assert np.array_equal(model.places, points.vertices)
-    assert most < 2 * len(files["points3D.txt"]) + 100 * 20_000
+    written(tmp_path, cameras)
+    names = [image.name for image in read_images(tmp_path / "images.bin")]
+    assert names == ["train/r_0.png", "a.JPG", "v1.2/b.png"]
 
 
 def test_parity() -> None:
@@ -187,11 +171,11 @@ def test_parity() -> None:
         check_cameras([camera], [camera.resized(8, 6)], "t.json", 0.0)
 
 
-def test_colmap_parity_of_binary_files(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A name or a colour in the binary files that differs from the source is refused."""
+def test_colmap_parity(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A name, a quaternion, a place or a colour in the files that differs from the source is refused."""
     camera = Camera("a b", np.eye(4), 4, 3, 5.0, 5.0, 2.0, 1.5)
     corners = box((0, 0, 0), (1, 1, 1))
-    write = colmap._binary_files
+    write = colmap._written
 
     def renamed(model: colmap._Model) -> dict[str, bytes]:
         return write(model._replace(images=[image._replace(name="a c") for image in model.images]))
@@ -199,22 +183,19 @@ def test_colmap_parity_of_binary_files(monkeypatch: pytest.MonkeyPatch) -> None:
     def black(model: colmap._Model) -> dict[str, bytes]:
         return write(model._replace(colours=np.zeros_like(model.colours)))
 
-    monkeypatch.setattr(colmap, "_binary_files", renamed)
+    def rounded(model: colmap._Model) -> dict[str, bytes]:
+        return write(model._replace(places=model.places.round(3)))
+
+    monkeypatch.setattr(colmap, "_written", renamed)
     with pytest.raises(ParityError, match=r"images\.bin: camera: expected a b\.png 4x3, got a c 4x3"):
         colmap_files([camera], corners)
-    monkeypatch.setattr(colmap, "_binary_files", black)
+    monkeypatch.setattr(colmap, "_written", black)
     with pytest.raises(ParityError, match=r"points3D\.bin: expected 8 points as sampled, got 8 others"):
         colmap_files([camera], corners)
-
-
-def test_colmap_parity(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A quaternion or a point in the files that differs from the source is refused."""
-    camera = Camera("a", np.eye(4), 4, 3, 5.0, 5.0, 2.0, 1.5)
-    corners = box((0, 0, 0), (1, 1, 1))
-    monkeypatch.setattr(colmap, "quaternion", lambda rotation: np.array([1.0, 0, 0, 0]))
-    with pytest.raises(ParityError, match=r"images\.txt: a\.png: pose: 2 apart"):
-        colmap_files([camera], corners)
-    monkeypatch.undo()
-    monkeypatch.setattr(colmap, "_numbers", lambda values: " ".join(f"{value:.3f}" for value in values))
-    with pytest.raises(ParityError, match=r"points3D\.txt: expected 8 points as sampled"):
+    monkeypatch.setattr(colmap, "_written", rounded)
+    with pytest.raises(ParityError, match=r"points3D\.bin: expected 8 points as sampled, got 8 others"):
         colmap_files([camera], replace(corners, vertices=corners.vertices + 1 / 3))
+    monkeypatch.undo()
+    monkeypatch.setattr(colmap, "quaternion", lambda rotation: np.array([1.0, 0, 0, 0]))
+    with pytest.raises(ParityError, match=r"images\.bin: a b\.png: pose: 2 apart"):
+        colmap_files([camera], corners)
