@@ -141,9 +141,8 @@ fi
 endef
 
 # Shell lines, not make functions: asked each time, because libraries come and go without a file that make could watch.
-# Darwin and machines other than x86-64 do not get Open3D (see the marker in pyproject.toml).
 system-libraries:  ## install the system libraries that a test needs, or say which
-	@test "$$(uname -sm)" = "Linux x86_64" || exit 0; \
+	@test "$$(uname -s)" = Linux || exit 0; \
 	missing=; for pair in $(SYSTEM_LIBRARIES); do \
 	  $(PYTHON) -c 'import ctypes, sys; ctypes.CDLL(sys.argv[1])' $${pair%%:*} 2>/dev/null \
 	    || missing="$$missing $${pair#*:}"; \

@@ -11,6 +11,7 @@ from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
+from packaging.requirements import Requirement
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 PACKAGES = ("player", "exporters", "vfr_bake")
@@ -235,6 +236,28 @@ def test_constraints_pin_exactly_and_cover_every_dependency() -> None:
     )
     assert len(wanted) > 16
     assert not {name.lower() for name in wanted} - pins
+
+
+@pytest.mark.parametrize(
+    ("system", "machine", "python", "wheels"),
+    [
+        ("linux", "x86_64", "3.10", {"numba", "usd-core", "xatlas", "open3d-cpu", "pycolmap"}),
+        ("linux", "aarch64", "3.10", {"numba", "open3d"}),
+        ("linux", "aarch64", "3.11", {"numba", "usd-core", "open3d"}),
+        ("darwin", "arm64", "3.10", {"numba", "usd-core", "xatlas", "open3d", "pycolmap"}),
+        ("darwin", "x86_64", "3.10", {"numba", "usd-core", "xatlas"}),
+        ("win32", "AMD64", "3.10", {"numba", "usd-core", "xatlas", "open3d", "pycolmap"}),
+    ],
+)
+def test_a_system_gets_the_packages_that_have_a_wheel_for_it(
+    system: str, machine: str, python: str, wheels: set[str]
+) -> None:
+    """The requirements with a marker that hold on a system are the packages that PyPI has wheels of there."""
+    text = (REPOSITORY / "pyproject.toml").read_text(encoding="utf-8")
+    requirements = [Requirement(line) for line in re.findall(r'^ +"([^"]+;[^"]+)"', text, re.MULTILINE)]
+    here = {"sys_platform": system, "platform_machine": machine, "python_version": python}
+    names = [each.name for each in requirements if each.marker and each.marker.evaluate(here)]
+    assert sorted(names) == sorted(wheels)
 
 
 def test_one_file_alone_names_instructions_of_one_processor() -> None:
