@@ -112,6 +112,7 @@ def open_picture(path: Path, formats: tuple[str, ...] = FORMATS) -> Iterator[Ima
             raise FormatError(f"{path}: picture: expected {expected}, got something else") from None
         except (
             *(OSError, ValueError, SyntaxError, TypeError, Image.DecompressionBombError),
+            *(RuntimeError, EOFError),  # from the decoders of AVIF and HEIC
             MemoryError,  # a chunk may claim to have gigabytes, which Pillow allocates at once
         ) as error:
             if isinstance(error, VfrError):

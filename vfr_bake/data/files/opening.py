@@ -40,7 +40,7 @@ def open_photograph(path: Path) -> Iterator[Image.Image]:
     try:
         with open_picture(path, ("HEIF",) if heic else FORMATS) as picture:
             yield picture
-    except (FormatError, RuntimeError, EOFError) as error:
+    except FormatError as error:
         if not heic or isinstance(error.__cause__, Image.DecompressionBombError):
             raise
         raise FormatError(

@@ -17,7 +17,7 @@ from vfr_bake.data import load_scene
 from vfr_bake.data.demo import demo_views
 from vfr_bake.data.files.looks import sensor_of
 from vfr_bake.data.files.orientation import TAG, as_stored, read_layout, turned_upright
-from vfr_bake.data.files.pictures import read_picture
+from vfr_bake.data.files.pictures import decoding_bytes, read_picture
 
 pillow_heif.register_heif_opener()
 
@@ -102,6 +102,22 @@ def test_a_heic_that_is_cut_short(n_bytes: int, tmp_path: Path) -> None:
     with pytest.raises(DataError, match="HEIC picture: cannot be read to its end: it is cut short") as raised:
         read_picture(path, upright=True)
     assert str(raised.value).startswith(f"{path}: ") and "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize("where", ["header", "pixels"])
+def test_a_damaged_avif(where: str, tmp_path: Path) -> None:
+    """Pillow raises RuntimeError, when it opens the file or when it decodes the pixels."""
+    path = tmp_path / "a.avif"
+    Image.fromarray(corners()).save(path)
+    data = path.read_bytes()
+    pixels = data.index(b"mdat") + 4
+    broken = data.replace(b"iloc", b"free") if where == "header" else data[:pixels].ljust(len(data), b"\xff")
+    path.write_bytes(broken)
+    with pytest.raises(DataError, match="picture: cannot be read to its end: Failed to decode ") as raised:
+        read_picture(path)
+    assert str(raised.value).startswith(f"{path}: ") and "\n" not in str(raised.value)
+    assert (decoding_bytes(path) == 1) == (where == "header")
+    assert sensor_of(path, 32, 48).focal is None
 
 
 def test_the_content_and_not_the_name_says_what_a_picture_is(tmp_path: Path) -> None:
