@@ -10,6 +10,7 @@ import io
 import os
 import re
 from collections.abc import Iterator
+from itertools import chain
 from pathlib import Path
 from pickletools import genops
 from typing import Any, BinaryIO
@@ -24,6 +25,12 @@ from player.files.memory import allowed_bytes, check_memory
 
 COPIES = 3
 """Most copies of a file's tensors in memory at a time: one is read, one is restored, one is checked."""
+MAX_VALUES = 2_000_000
+"""The most values in a file, where one that is referred to twice counts twice, and 64 characters of a text
+count as a value, too. So a file of a kilobyte cannot become gigabytes of JSON or of an error message."""
+MAX_DEPTH = 64
+"""The most lists and dicts inside one another; Python's own functions fail at some hundreds."""
+_END = object()
 _PLAIN = re.compile(r"torch [A-Za-z0-9]+Storage|torch\._utils _rebuild_tensor_v2|collections OrderedDict")
 """Names of functions and types that a pickle of tensors and plain values may contain."""
 
@@ -72,10 +79,7 @@ def read_tensors(path: Path, what: str, max_memory: float | None = None, from_el
             content = torch.load(file, map_location="cpu", weights_only=True)
         except Exception as error:  # torch.load does not document which errors it raises
             raise FormatError(f"{path}: not {what}, or cut short") from error
-    if not all(_is_whole(tensor) for tensor in _tensors(content)):
-        raise FormatError(
-            f"{path}: not {what}: expected all numbers of a tensor in the file, got one for many"
-        )
+    _check_values(content, f"{path}: not {what}")
     return content
 
 
@@ -118,20 +122,26 @@ def check_kinds(content: dict[str, Any], kinds: dict[str, type], where: str) -> 
             )
 
 
-def _tensors(content: Any) -> Iterator[torch.Tensor]:
-    """Yield every tensor in plain values once, however often it is referred to."""
-    left, seen = [content], set()
+def _check_values(content: Any, where: str) -> None:
+    """Raise FormatError if tensors in `content` are not whole, or if its plain values are more, deeper or
+    larger than allowed."""
+    left, n_values = [iter((content,))], 0.0
     while left:
-        value = left.pop()
-        if id(value) in seen:
+        value = next(left[-1], _END)
+        if value is _END:
+            left.pop()
             continue
-        seen.add(id(value))
-        if isinstance(value, torch.Tensor):
-            yield value
-        elif isinstance(value, dict):
-            left += [*value.keys(), *value.values()]
+        n_values += 1 + (len(value) / 64 if isinstance(value, str | bytes) else 0)
+        if n_values > MAX_VALUES:
+            raise FormatError(f"{where}: expected at most {MAX_VALUES} values, got more")
+        if isinstance(value, torch.Tensor) and not _is_whole(value):
+            raise FormatError(f"{where}: expected all numbers of a tensor in the file, got one for many")
+        if isinstance(value, dict):
+            left.append(chain(value.keys(), value.values()))
         elif isinstance(value, list | tuple | set | frozenset):
-            left += value
+            left.append(iter(value))
+        if len(left) > MAX_DEPTH:
+            raise FormatError(f"{where}: expected at most {MAX_DEPTH} values inside one another, got more")
 
 
 def _is_whole(tensor: torch.Tensor) -> bool:

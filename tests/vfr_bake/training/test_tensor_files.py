@@ -42,14 +42,32 @@ def test_one_number_in_ten_thousand_million_places(tmp_path: Path) -> None:
         read_tensors(path, "a model")
 
 
-def test_values_that_refer_to_each_other(tmp_path: Path) -> None:
-    """Thirty lists, each twice in the next, can be read: a thousand million ways lead to the first."""
-    inner: list = [torch.zeros(2)]
-    for _ in range(30):
+def twice_in_the_next(inner: list, n_lists: int) -> list:
+    for _ in range(n_lists):
         inner = [inner, inner]
+    return inner
+
+
+def test_values_that_refer_to_each_other(tmp_path: Path) -> None:
+    """Lists that are each twice in the next can be read as long as few ways lead to the first. Thirty of them
+    are refused: as JSON they would take gigabytes."""
     path = tmp_path / "model.pt"
-    write_tensors(path, {"a": inner})
-    read_tensors(path, "a model")
+    write_tensors(path, {"a": twice_in_the_next([torch.zeros(2)], 10)})
+    assert len(read_tensors(path, "a model")["a"]) == 2
+    endless: list = []
+    endless.append(endless)
+    deep: list = []
+    for _ in range(100):
+        deep = [deep]
+    for values, message in [
+        (twice_in_the_next([torch.zeros(2)], 30), "at most 2000000 values, got more"),
+        (twice_in_the_next(["a" * 10_000], 20), "at most 2000000 values, got more"),
+        (endless, "at most 64 values inside one another"),
+        (deep, "at most 64 values inside one another"),
+    ]:
+        write_tensors(path, {"a": values})
+        with pytest.raises(FormatError, match=f"not a model: expected {message}"):
+            read_tensors(path, "a model")
 
 
 def test_what_is_no_tensor(tmp_path: Path) -> None:
