@@ -35,7 +35,7 @@ from vfr_bake.bench.result import Setting, Trade, conclude
 from vfr_bake.bench.timing import Dials, Size, frame_times, measure_times
 from vfr_bake.bench.worst import WorstPixel, worst_pixels
 from vfr_bake.config import BenchConfig
-from vfr_bake.data import load_scene_as
+from vfr_bake.data import check_settings, load_scene_as
 from vfr_bake.data.scene import evenly
 from vfr_bake.training.model_file import load_model
 from vfr_bake.training.scores.evaluation import RenderedView, beside_photograph
@@ -324,7 +324,8 @@ def _all_dials(config: BenchConfig, assets: list[Asset]) -> list[Dials]:
 
 def describe(asset: Asset) -> dict[str, Any]:
     """Return what an asset is made of, as far as its manifest says."""
-    manifest, baked = asset.manifest, asset.manifest.provenance.get("bake", {})
+    manifest, baked = asset.manifest, asset.manifest.provenance.get("bake")
+    baked = baked if isinstance(baked, dict) else {}  # the provenance has no fixed form
     width = baked.get("head_width")
     return {
         "preset": baked.get("preset"),
@@ -349,6 +350,7 @@ def _read_views(config: BenchConfig, assets: list[Asset], progress: Report) -> t
     """Return the views to compare, in an order of which every beginning is spread evenly, and lines to
     print."""
     train = assets[0].manifest.provenance.get("train", {})
+    check_settings(train, f"{assets[0].folder}: provenance: train")
     scene = load_scene_as(
         train,
         assets[0].manifest.contracted,

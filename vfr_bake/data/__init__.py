@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from player.cameras.colmap import colmap_folder
-from player.errors import DataError
+from player.errors import DataError, FormatError
+from player.files.json_files import as_float, brief
 from player.progress import Progress
 from vfr_bake.config import SceneKind, TrainConfig
 from vfr_bake.data.demo import demo_capture
@@ -28,6 +29,7 @@ __all__ = [
     "PosedImages",
     "Scene",
     "check_scale",
+    "check_settings",
     "load_scene",
     "load_scene_as",
     "needs_cameras",
@@ -91,6 +93,26 @@ def training_reader(
     for the next run."""
     default = config.max_side is None and config.downscale is None
     return PictureReader(working_size(config), model, on_disk=True, kept=kept, may_shrink=default, say=say)
+
+
+def check_settings(settings: object, where: str) -> None:
+    """Raise FormatError unless `reader_as` and `load_scene_as` understand the settings of a training that the
+    file `where` records."""
+    if not isinstance(settings, dict):
+        raise FormatError(f"{where}: expected the settings of a training, got {brief(settings)}")
+    for key in ("max_side", "downscale"):
+        value = settings.get(key)
+        if value is not None and (type(value) is not int or not 1 <= value <= 65536):
+            raise FormatError(f"{where}: {key}: expected 1 to 65536, got {brief(value)}")
+    scale = settings.get("scale")
+    if scale is not None and not _is_scale(scale):
+        raise FormatError(f"{where}: scale: expected two pictures and a distance, got {brief(scale)}")
+
+
+def _is_scale(scale: object) -> bool:
+    if not isinstance(scale, list | tuple) or len(scale) != 3:
+        return False
+    return all(isinstance(name, str) for name in scale[:2]) and 0 < (as_float(scale[2]) or 0) < 1e9
 
 
 def reader_as(settings: dict[str, Any]) -> PictureReader:

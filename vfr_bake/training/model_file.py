@@ -19,6 +19,7 @@ files).
 
 from __future__ import annotations
 
+import json
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -31,8 +32,9 @@ from torch import nn
 from player.cameras.camera import Camera
 from player.cameras.transforms import parse_transforms, transforms_cameras, write_cameras
 from player.errors import ConfigError, FormatError, VersionError
-from player.files.json_files import brief
+from player.files.json_files import as_float, brief
 from vfr_bake.config import FieldConfig, field_config_from
+from vfr_bake.data import check_settings
 from vfr_bake.data.scene import WHITE
 from vfr_bake.data.view_pixels import SomePixels, ViewPixels
 from vfr_bake.data.witnesses import Witnesses
@@ -255,6 +257,7 @@ def load_model(path: Path, max_memory: float | None = None) -> Model:
         raise FormatError(
             f"{path}: object_background: expected 3 numbers from 0 to 1, got {brief(background)}"
         )
+    _check_record(content["train"], content["figures"], path)
     return Model(
         field=field,
         sampler=sampler,
@@ -272,6 +275,20 @@ def load_model(path: Path, max_memory: float | None = None) -> Model:
 
 def _is_level(value: Any) -> bool:
     return isinstance(value, float) and 0 <= value <= 1
+
+
+def _check_record(train: dict[str, Any], figures: dict[str, Any], path: Path) -> None:
+    """Raise FormatError unless the settings and the figures of the training can be used, and written to the
+    manifest of an asset at the end of a bake."""
+    check_settings(train, f"{path}: train")
+    psnr = figures.get("training_psnr")
+    if psnr is not None and as_float(psnr) is None:
+        raise FormatError(f"{path}: figures: training_psnr: expected a finite number, got {brief(psnr)}")
+    for name, record in (("train", train), ("figures", figures)):
+        try:
+            json.dumps(record, sort_keys=True, allow_nan=False)
+        except (TypeError, ValueError) as error:
+            raise FormatError(f"{path}: {name}: expected finite JSON values: {brief(str(error))}") from error
 
 
 def _read(path: Path, max_memory: float | None) -> dict[str, Any]:

@@ -18,6 +18,7 @@ from player.asset.bricks import pack_vertices
 from player.asset.manifest import CONTRACTED_AABB, Manifest
 from player.cameras.camera import Camera
 from player.cameras.transforms import read_cameras, write_cameras
+from player.errors import FormatError
 from player.render import render
 from tests.player.conftest import head_bytes
 from tests.player.march.contracted_scene import RANGE, RESOLUTION, STEP, vertices_and_codes
@@ -27,7 +28,7 @@ from vfr_bake.bench.front import Point, beats, pareto_front, recommend
 from vfr_bake.bench.process import Process
 from vfr_bake.bench.result import MAX_PSNR
 from vfr_bake.bench.timing import Dials, Times, lookup_slope, measure_times
-from vfr_bake.bench.trade import Views, _read_views, _Run
+from vfr_bake.bench.trade import Views, _read_views, _Run, describe
 from vfr_bake.bench.worst import APART, worst_pixels
 from vfr_bake.cli import bench_main
 from vfr_bake.config import BakeConfig, BenchConfig, FieldConfig
@@ -129,10 +130,11 @@ def test_the_command_that_bakes_again_names_what_was_chosen(contracted: bool, sh
     ],
 )
 def test_settings_that_no_bake_has_written(remembered: object, shells_folder: Path) -> None:
-    """Recorded settings that no bake has written, which may have any form, give no command."""
+    """Recorded settings that no bake has written, which may have any form, give no command and no error."""
     asset = Asset.open(shells_folder)
     manifest = replace(asset.manifest, provenance={"bake": remembered})
     assert bake_command("out", replace(asset, manifest=manifest)) == ""
+    assert describe(replace(asset, manifest=manifest))["n_fetches"] == manifest.n_fetches
 
 
 def test_quality_is_that_of_the_pictures(results: tuple[dict, str]) -> None:
@@ -491,3 +493,6 @@ def test_what_training_never_wrote_is_no_exposure(
     asset = replace(asset, manifest=replace(asset.manifest, provenance={"trained": remembered}))
     config = BenchConfig(assets=(shells_folder,), data=str(data))
     assert not _read_views(config, [asset], lambda *_: None)[0].exposure
+    asset = replace(asset, manifest=replace(asset.manifest, provenance={"train": [remembered]}))
+    with pytest.raises(FormatError, match="provenance: train: expected the settings of a training"):
+        _read_views(config, [asset], lambda *_: None)
