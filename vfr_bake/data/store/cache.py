@@ -131,7 +131,8 @@ def note_use(folder: Path, model: Path) -> None:
     with suppress(OSError):
         known = _models(folder)
         name = str(model.absolute())
-        (folder / MODELS).write_text("\n".join([*(known - {name}), name]), encoding="utf-8")
+        text = "\n".join([*(known - {name}), name])
+        (folder / MODELS).write_text(text, encoding="utf-8", errors="surrogateescape")
 
 
 def remove_unused(root: Path, wanted: int, keep: Path) -> None:
@@ -157,8 +158,8 @@ def _is_there(model: Path) -> bool:
 
 
 def _models(folder: Path) -> set[str]:
-    with suppress(OSError, UnicodeDecodeError):
-        return set((folder / MODELS).read_text(encoding="utf-8").splitlines())
+    with suppress(OSError):
+        return set((folder / MODELS).read_text(encoding="utf-8", errors="surrogateescape").splitlines())
     return set()
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -193,8 +194,12 @@ def test_without_a_cache_nothing_stays(folder: Path, root: Path, tmp_path: Path)
     assert views.images[0].shape == (32, 32, 4)
 
 
-def test_a_set_goes_with_its_models(folder: Path, root: Path, tmp_path: Path) -> None:
-    model = tmp_path / "model.pt"
+NOT_ON_MACOS = pytest.mark.skipif(sys.platform == "darwin", reason="macOS has no names but UTF-8")
+
+
+@pytest.mark.parametrize("name", ["model.pt", pytest.param("mod\udce8l.pt", marks=NOT_ON_MACOS)])
+def test_a_set_goes_with_its_models(name: str, folder: Path, root: Path, tmp_path: Path) -> None:
+    model = tmp_path / name
     model.write_bytes(b"")
     load(folder, model, kept=True)
     (kept,) = root.iterdir()
