@@ -179,6 +179,9 @@ def model(shells_folder: Path, tmp_path: Path) -> Path:
     folder.mkdir(parents=True)
     for name, data in colmap_files(cameras, empty).items():
         (folder / name).write_bytes(data)
+    pycolmap.Reconstruction(str(folder)).write_text(str(folder))
+    for path in folder.glob("*.bin"):
+        path.unlink()
     return folder
 
 
