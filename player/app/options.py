@@ -213,6 +213,7 @@ def make_parser() -> argparse.ArgumentParser:
         "others",
         type=asset_folder,
         nargs="*",
+        default=[],  # without a default, argparse would call them required
         metavar="asset",
         help="more folders, whose assets the viewer can switch to",
     )

@@ -302,6 +302,11 @@ def test_usage(
     assert message in capsys.readouterr().err
 
 
+def test_an_asset_that_is_not_named_is_missed_once(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main([]) == 2
+    assert capsys.readouterr().err.endswith("the following arguments are required: asset\n")
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
