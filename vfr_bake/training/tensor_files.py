@@ -6,7 +6,6 @@ there is always a whole file.
 
 from __future__ import annotations
 
-import io
 import os
 import re
 from collections.abc import Iterator
@@ -19,7 +18,7 @@ from zipfile import ZIP_STORED, ZipFile
 import torch
 
 from player.errors import FormatError
-from player.files.files import file_size, open_file, write_bytes
+from player.files.files import file_size, new_file, open_file
 from player.files.json_files import brief
 from player.files.memory import allowed_bytes, check_memory
 
@@ -36,10 +35,10 @@ _PLAIN = re.compile(r"torch [A-Za-z0-9]+Storage|torch\._utils _rebuild_tensor_v2
 
 
 def write_tensors(path: Path, content: dict[str, Any]) -> None:
-    """Write `content`, which holds tensors and plain values, to `path`."""
-    buffer = io.BytesIO()
-    torch.save(content, buffer)
-    write_bytes(path, buffer.getvalue())
+    """Write `content`, which holds tensors and plain values, to `path`. It goes to the disk piece by piece: a
+    checkpoint has hundreds of megabytes, which would take as much memory again."""
+    with new_file(path) as temporary, temporary.open("xb") as file:
+        torch.save(content, file)
 
 
 def on_cpu(content: Any) -> Any:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import collections
 import pickle
+import tracemalloc
 import zipfile
 from pathlib import Path
 
@@ -40,6 +41,18 @@ def test_one_number_in_ten_thousand_million_places(tmp_path: Path) -> None:
     assert path.stat().st_size < 10_000
     with pytest.raises(FormatError, match=r"expected all numbers of a tensor in the file, got one for many"):
         read_tensors(path, "a model")
+
+
+def test_memory_of_writing(tmp_path: Path) -> None:
+    """Tensors go to the disk without a copy of the whole file in memory."""
+    tensor = torch.zeros(10_000_000)
+    tracemalloc.start()
+    try:
+        write_tensors(tmp_path / "model.pt", {"a": tensor})
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert peak < tensor.nbytes / 10
 
 
 def twice_in_the_next(inner: list, n_lists: int) -> list:
