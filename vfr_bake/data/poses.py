@@ -153,8 +153,8 @@ def estimate_cameras(
     taken.
 
     Raises DataError (no pictures that can be used, with advice on what to photograph differently; a COLMAP
-    model as text), FormatError (a damaged `sparse/0`), OutputError (the folder is read-only),
-    MissingExtraError.
+    model as text), FormatError (a damaged `sparse/0`), OutputError (the folder is read-only, or the disk of
+    temporary files is full), MissingExtraError.
     """
     if is_video(photos):
         photos = video.extract_frames(photos, lambda done, of: progress("frames", done, of), say)
@@ -309,11 +309,20 @@ def _placed(
     def built(some: Sequence[Pair], stage: str, attempt: Attempt = FIRST_ATTEMPT) -> list[Any]:
         with tempfile.TemporaryDirectory(prefix="vfr-poses-", ignore_cleanup_errors=True) as name:
             database = Path(name) / "database.db"
-            write_database(database, names, sensors, features, some)
-            found = map_pictures(
-                database, place, Path(name), len(names), lambda *n: progress(stage, *n), attempt
-            )
-            found = joined(found, database, place)
+            try:
+                write_database(database, names, sensors, features, some)
+                found = map_pictures(
+                    database, place, Path(name), len(names), lambda *n: progress(stage, *n), attempt
+                )
+                found = joined(found, database, place)
+            except RuntimeError as error:
+                if "database" not in str(error):
+                    raise
+                reason = str(error).rpartition("] ")[2].rstrip(".")  # behind the place in COLMAP's source
+                raise OutputError(
+                    f"{database}: cannot write: {reason}: make room for temporary files there, or set TMPDIR "
+                    "to a folder on another disk"
+                ) from error
         if found:
             refine_principal_points(found[0])
         return found
@@ -436,7 +445,7 @@ def _read_report(model: Path, folder: Path, n_pictures: int) -> PoseReport:
             at += 51 + 8 * length
             n_seen += length
             error_sum += error
-    except struct.error:
+    except (struct.error, OverflowError):
         at = -1
     if at != len(points):
         raise FormatError(f"{model}: cut short: remove {model} to estimate the cameras anew")

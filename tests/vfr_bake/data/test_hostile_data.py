@@ -16,6 +16,7 @@ from player.cameras.views import read_views
 from player.errors import DataError, FormatError
 from vfr_bake.data import load_scene
 from vfr_bake.data.files.pictures import read_picture
+from vfr_bake.data.poses import estimate_cameras
 
 
 def png(width: int, height: int, bits: int = 8, colour: int = 2) -> bytes:
@@ -107,6 +108,16 @@ def test_cameras(name: str, make: Callable[[Path], None], data: Path) -> None:
         load_scene(data)
     with pytest.raises(FormatError, match=f"{path}: (size: expected|cannot read: expected a file)"):
         read_views(path)
+
+
+def test_a_track_that_is_longer_than_any_file(tmp_path: Path) -> None:
+    model = tmp_path / "sparse" / "0"
+    model.mkdir(parents=True)
+    (model / "cameras.bin").write_bytes(b"")
+    (model / "images.bin").write_bytes(struct.pack("<Q", 3))
+    (model / "points3D.bin").write_bytes(struct.pack("<Q35xdQ", 2, 0.5, 1 << 62))
+    with pytest.raises(FormatError, match="cut short: remove"):
+        estimate_cameras(tmp_path, lambda *_: None)
 
 
 def test_json_of_many_values(tmp_path: Path) -> None:

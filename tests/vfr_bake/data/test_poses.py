@@ -274,6 +274,14 @@ def test_a_folder_that_cannot_be_written_is_refused_at_once(tmp_path: Path, monk
     assert not stages
 
 
+def test_a_folder_for_temporary_files_that_cannot_be_written_is_named(tmp_path: Path, monkeypatch):
+    """COLMAP raises RuntimeError for a disk that is full, as for a folder that is not there."""
+    photos = save(tmp_path, [textured(seed) for seed in range(3)])
+    monkeypatch.setattr(poses, "write_database", lambda path, *_: pycolmap.Database.open(path / "none"))
+    with pytest.raises(OutputError, match=r"database\.db: cannot write: .*: make room for temporary files"):
+        estimate_cameras(photos, quiet)
+
+
 def test_a_cache_that_cannot_be_written_is_done_without(can, tmp_path: Path, monkeypatch):
     (tmp_path / "file").write_bytes(b"")
     monkeypatch.setattr(poses, "cache_root", lambda: tmp_path / "file")
