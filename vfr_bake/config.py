@@ -44,6 +44,17 @@ the paper's head would take about half of a step's time, and a head of half its 
 many steps (docs/notes/2026-11-25-width-of-the-head.md)."""
 
 
+def object_table_size(n_pixels: int) -> int:
+    """Return log2 of the entries of an object's larger tables on a CPU: about a quarter of the pixels that
+    are trained on, because the more they say, the more places must not share an entry
+    (docs/notes/2026-11-30-tables-and-directions.md).
+
+    >>> object_table_size(64 * 256**2), object_table_size(100 * 400**2), object_table_size(10**9)
+    (20, 22, 22)
+    """
+    return min(max(20, round(math.log2(max(n_pixels, 1) / 4))), 22)
+
+
 def check(settings: object, name: str, fits: bool, expected: str) -> None:
     """Raise ConfigError, which says what was `expected`, unless the setting `name` `fits`."""
     if not fits:
@@ -128,8 +139,9 @@ class FieldOptions:
     max_resolution: int | None = None
     """Cells per axis of the finest level; objects 512 (over the box), scenes 2048 (over contracted space)."""
     log2_table_size: int | None = None
-    """A level with more vertices than two to this power shares entries by hashing; CPU 20, because places
-    that share an entry disturb each other in views that are not learned from; GPU 19, as in the paper."""
+    """A level with more vertices than two to this power shares entries by hashing. CPU: 20, because places
+    that share an entry disturb each other in views that are not learned from; up to 22 for an object whose
+    pictures have more than 6 million pixels in all. GPU: 19, as in the paper."""
     density_width: int | None = None
     """Hidden width of the density network, 0 for a linear map; objects 64, scenes 0, as in the paper."""
     compositing: Compositing = "features"
@@ -148,11 +160,16 @@ class FieldOptions:
     n_sh_features: int | None = None
     """Features that multiply each basis function; objects 4, scenes 8, as in the paper."""
 
-    def resolved(self, unbounded: bool, device: str = "cpu") -> FieldConfig:
-        """Return the architecture with every open setting filled in. Raises ConfigError for values out of
-        range."""
+    def resolved(self, unbounded: bool, device: str = "cpu", n_pixels: int = 0) -> FieldConfig:
+        """Return the architecture with every open setting filled in. `n_pixels`: those of all pictures that
+        are trained on. Raises ConfigError for values out of range."""
+        chosen = FIELD_BY_DEVICE[device]
+        if unbounded:
+            chosen = UNBOUNDED_FIELD | chosen
+        elif device == "cpu":
+            chosen = chosen | {"log2_table_size": object_table_size(n_pixels)}
         given = {name: value for name, value in asdict(self).items() if value is not None}
-        return FieldConfig(**((UNBOUNDED_FIELD if unbounded else {}) | FIELD_BY_DEVICE[device] | given))
+        return FieldConfig(**(chosen | given))
 
 
 @dataclass(frozen=True, kw_only=True)

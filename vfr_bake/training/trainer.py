@@ -110,11 +110,11 @@ class Trainer:
         self.processes = processes or Processes(0, 1)
         self._backend: Backend = backend or ("numba" if self.device.type == "cpu" else "torch")
         if self._backend == "torch" and self.processes.size > 1:
-            raise ConfigError(
-                f"device: several processes: expected cpu, got {self.device.type}: pass --device cpu, or "
-                "start one process"
-            )
-        self._field = VfrField(config.field.resolved(scene.unbounded, self.device.type)).to(self.device)
+            advice = "pass --device cpu, or start one process"
+            raise ConfigError(f"device: several processes: expected cpu, got {self.device.type}: {advice}")
+        n_pixels = sum(camera.width * camera.height for camera in scene.train.cameras)
+        settings = config.field.resolved(scene.unbounded, self.device.type, n_pixels)
+        self._field = VfrField(settings).to(self.device)
         self._field.grid.backend = self._backend
         self.pilot = Pilot(self._field.config).to(self.device)
         self.n_bad_steps = 0
