@@ -208,7 +208,6 @@ def write_together(files: dict[Path, bytes]) -> None:
         with _temporary_folder(first) as folder:
             for path, data in files.items():
                 (folder / path.name).write_bytes(data)
-            sync_all(folder)
             put_together(folder, first.name)
 
 

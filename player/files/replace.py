@@ -16,6 +16,10 @@ A temporary file may belong to a process that is still writing. Every process th
 on the folder (flock), which the system releases when the process ends, however it ends. Only a process that
 gets an exclusive lock removes what is left. Windows has no such lock, and some network disks have none: there
 `.part` files stay until somebody removes them.
+
+An archive that somebody has unpacked may hold a folder `.NAME.together`, too, and must not replace any file.
+Therefore files are moved only if the folder has a mark, a file that holds its own inode number: an archive
+cannot know this number, which the disk gives to the file when it is made.
 """
 
 from __future__ import annotations
@@ -25,6 +29,7 @@ import errno
 import os
 import re
 import shutil
+import stat
 import sys
 import time
 from collections.abc import Iterator
@@ -35,6 +40,8 @@ from pathlib import Path
 from player.errors import OutputError
 
 PART = ".part"
+MARK = ".inode"
+"""Name of the file in `.NAME.together` that tells it from an unpacked folder."""
 PAUSES = (0.05, 0.1, 0.2, 0.5, 1.0, 2.0)
 """Seconds between the tries to rename a file that another program has open, on Windows."""
 _PARTS = re.compile(r"\..+\.[a-z0-9_]{8}\.part", re.DOTALL)  # 8 characters, as `tempfile` makes them, too
@@ -85,8 +92,8 @@ _clear_up_once = cache(clear_up)
 
 def _clear_up(path: Path, alone: bool) -> None:
     if _TOGETHER.fullmatch(path.name):
-        move_out(path)
-    elif replaced := _REPLACED.fullmatch(path.name):
+        _finish(path)
+    elif (replaced := _REPLACED.fullmatch(path.name)) and path.is_dir():
         place = path.with_name(replaced[1])
         if not os.path.lexists(place):
             path.replace(place)
@@ -166,38 +173,68 @@ def put_together(new: Path, name: str) -> None:
     killed meanwhile, the next one that writes there finishes the moving.
 
     Args:
-        new: a temporary folder, complete.
+        new: a temporary folder, with all files; they are synced here.
         name: the name of one of the files.
 
     Raises OSError: nothing has changed, or, where a file is in use, some files are still to be moved.
     """
     together = new.with_name(f".{name}.together")
+    mark(new)
+    sync_all(new)
     for tries_left in reversed(range(10)):
         try:
             new.rename(together)
             break
         except OSError:
-            if not together.is_dir() or not tries_left:
+            if not together.is_dir():
                 raise
-            move_out(together)  # of another process that writes the same files: they come first
+            if not tries_left:
+                raise OutputError(f"{together}: cannot write: remove this folder, or rename it") from None
+            _finish(together)  # of another process that writes the same files: they come first
     sync(together.parent)
     move_out(together)
 
 
-def move_out(folder: Path) -> None:
-    """Move the files in the folder `.NAME.together` to the folder that contains it, and remove it. Other
-    processes may do the same at the same time.
+def mark(folder: Path) -> None:
+    """Write a file into `folder` that says that this program has made the folder (`is_marked`)."""
+    path = folder / MARK
+    path.touch()
+    path.write_text(str(path.stat().st_ino))
 
-    A folder that somebody has unpacked may have such a name, too. Therefore only files whose names are the
-    same as NAME up to the first dot are moved.
-    """
+
+def is_marked(folder: Path) -> bool:
+    """Return whether this program has made `folder`: not if it was copied or unpacked."""
+    path = folder / MARK
+    try:
+        found = path.lstat()
+        number = str(found.st_ino).encode()
+        return stat.S_ISREG(found.st_mode) and found.st_size == len(number) and path.read_bytes() == number
+    except OSError:
+        return False
+
+
+def _finish(folder: Path) -> None:
+    """Move the files out of a folder `.NAME.together` that this program has made; remove an empty one."""
+    if is_marked(folder):
+        move_out(folder)
+    else:
+        with suppress(OSError):
+            folder.rmdir()
+
+
+def move_out(folder: Path) -> None:
+    """Move the files in the folder `.NAME.together` whose names are the same as NAME up to the first dot to
+    the folder that contains it, and remove it. Other processes may do the same at the same time."""
     together = _TOGETHER.fullmatch(folder.name)
     if together is None or folder.is_symlink() or not folder.is_dir():
         return
     for path in sorted(folder.iterdir()):
-        if path.name.split(".")[0] == together[1].split(".")[0] and path.is_file() and not path.is_symlink():
+        is_ours = path.name != MARK and path.name.split(".")[0] == together[1].split(".")[0]
+        if is_ours and path.is_file() and not path.is_symlink():
             with suppress(FileNotFoundError):
                 rename(path, folder.parent / path.name)
+    with suppress(OSError):
+        (folder / MARK).unlink()  # last: without it, nobody moves the rest
     with suppress(OSError):
         folder.rmdir()
 

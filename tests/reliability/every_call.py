@@ -30,7 +30,7 @@ import torch
 from exporters.cli import main as export_main
 from player.app.cli import main as play_main
 from player.asset.asset import Asset
-from player.files.replace import clear_up
+from player.files.replace import MARK, clear_up, mark
 from tests.player.conftest import write_shells
 from tests.reliability import stops
 from tests.reliability.kill import BAKE, SMALL, _write_data, contents, forked
@@ -156,6 +156,8 @@ class Trial:
             self._out.mkdir(parents=True)
         else:
             shutil.copytree(folder, self._out)
+            for left in self._out.glob(f".*/{MARK}"):  # a copy has another inode number
+                mark(left.parent)
 
     def _main(self, more: list[str]) -> int:
         quiet = os.open(os.devnull, os.O_WRONLY)

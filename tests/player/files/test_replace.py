@@ -14,7 +14,7 @@ import pytest
 from player.asset.asset import Asset
 from player.errors import FormatError, OutputError
 from player.files.files import check_target, new_file, new_folder, write_bytes, write_together
-from player.files.replace import clear_up, exchange, held
+from player.files.replace import MARK, clear_up, exchange, held, mark
 from tests.player.conftest import write_shells
 
 needs_locks = pytest.mark.skipif(os.name == "nt", reason="Windows has no locks on folders")
@@ -141,7 +141,7 @@ def test_files_that_belong_together_are_all_new_after_the_next_command(tmp_path:
     """After a process was killed after the first of three moves, the next command does the other two."""
     fill(tmp_path, "old", "a.mtl", "a.png")
     fill(tmp_path, "new", "a.obj")
-    fill(tmp_path / ".a.obj.together", "new", "a.mtl", "a.png")
+    mark(fill(tmp_path / ".a.obj.together", "new", "a.mtl", "a.png"))
     with pytest.raises(OutputError, match="already exists"):
         check_target(tmp_path / "a.obj")
     assert names(tmp_path) == ["a.mtl", "a.obj", "a.png"]
@@ -153,7 +153,7 @@ def test_what_another_process_has_begun_to_move_is_moved_first(
 ) -> None:
     monkeypatch.setattr("player.files.replace.clear_up", lambda folder: None)
     monkeypatch.setattr("player.files.replace._clear_up_once", lambda folder: None)
-    fill(tmp_path / ".a.obj.together", "first", "a.mtl", "a.lod1.obj")
+    mark(fill(tmp_path / ".a.obj.together", "first", "a.mtl", "a.lod1.obj"))
     write_together({tmp_path / "a.obj": b"second", tmp_path / "a.mtl": b"second"})
     assert {path.name: path.read_text() for path in tmp_path.iterdir()} == {
         "a.obj": "second",
@@ -163,17 +163,39 @@ def test_what_another_process_has_begun_to_move_is_moved_first(
 
 
 def test_an_unpacked_folder_replaces_nothing_else(tmp_path: Path) -> None:
-    """A folder from an archive that looks like an interrupted move replaces no other files."""
+    """A folder from an archive that looks like an interrupted move replaces no files, even with the mark of
+    one that was copied."""
+    fill(tmp_path, "mine", "a.docx", "report.docx", ".bashrc")
+    hostile = fill(tmp_path / ".a.obj.together", "theirs", "a.docx", "report.docx", ".bashrc", "a.png")
+    for number in ("", "1", str(hostile.stat().st_ino)):
+        (hostile / MARK).write_text(number)
+        check_target(tmp_path / "a.obj")
+        with pytest.raises(FormatError, match="got nothing"):
+            Asset.open(tmp_path / "mistyped")
+        with pytest.raises(OutputError, match=r"\.a\.obj\.together: cannot write: remove this folder"):
+            write_together({tmp_path / "a.obj": b"", tmp_path / "a.mtl": b""})
+        assert {path.read_text() for path in tmp_path.iterdir() if path.is_file()} == {"mine"}
+        assert not {"a.obj", "a.png"} & set(names(tmp_path))
+
+
+def test_a_move_takes_only_files_that_belong_to_the_name(tmp_path: Path) -> None:
     fill(tmp_path, "mine", "report.docx", ".bashrc")
-    hostile = fill(tmp_path / ".a.obj.together", "theirs", "report.docx", ".bashrc", "a.png")
-    (hostile / "a").mkdir()
-    (hostile / "a.lnk").symlink_to(tmp_path / "report.docx")
+    folder = fill(tmp_path / ".a.obj.together", "theirs", "report.docx", ".bashrc", "a.png")
+    (folder / "a").mkdir()
+    (folder / "a.lnk").symlink_to(tmp_path / "report.docx")
+    mark(folder)
     check_target(tmp_path / "a.obj")
     assert (tmp_path / "report.docx").read_text() == (tmp_path / ".bashrc").read_text() == "mine"
     assert (tmp_path / "a.png").is_file() and not (tmp_path / "a").exists()
     with pytest.raises(OutputError, match="cannot write"):
         write_together({tmp_path / "a.obj": b"", tmp_path / "a.mtl": b""})
     assert not (tmp_path / "a.obj").exists()
+
+
+def test_a_file_that_is_called_like_a_replaced_folder_stays(tmp_path: Path) -> None:
+    fill(tmp_path, "mine", ".bashrc.replaced", ".a.replaced", "a")
+    check_target(tmp_path / "scene")
+    assert names(tmp_path) == [".a.replaced", ".bashrc.replaced", "a"]
 
 
 def test_files_are_written_together_or_not_at_all(tmp_path: Path) -> None:
