@@ -12,7 +12,7 @@ from PIL import Image
 from player.cameras.camera import Camera
 from player.errors import DataError, FormatError, MissingExtraError
 from player.files.files import open_file, read_bytes
-from player.files.images import MAX_FILE_BYTES
+from player.files.images import BAND, MAX_FILE_BYTES
 from vfr_bake.data.capture import PosedImages
 from vfr_bake.data.files.opening import open_photograph
 from vfr_bake.data.files.orientation import PictureHeader, as_stored, layout_of, read_layout, turned_upright
@@ -162,9 +162,9 @@ def _decoded(path: Path, file: Image.Image) -> np.ndarray:
     file.load()
     if file.mode == "I" or file.mode.startswith("I;16"):
         # Pillow's own conversion clips 16-bit greys at 255.
-        grey = np.asarray(file.convert("I"), np.int64).clip(0, 65535)
+        grey = _as_8_bit(np.asarray(file.convert("I")))
         rgba = np.full((*grey.shape, 4), 255, np.uint8)
-        rgba[..., :3] = ((grey * 255 + 32767) // 65535)[..., None]
+        rgba[..., :3] = grey[..., None]
         return rgba
     if file.mode == "F":
         raise DataError(f"{path}: picture: expected 8 or 16 bits a channel, got floating point")
@@ -190,11 +190,12 @@ def _is_16_bit_colour(path: Path) -> bool:
 
 def _read_16_bit_colour(path: Path) -> np.ndarray:
     cv2 = opencv(f"{path}: 16-bit picture: expected OpenCV to read it", "train")
-    data = read_bytes(path, "a picture", MAX_FILE_BYTES)
-    values = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)  # as stored
+    file = np.frombuffer(read_bytes(path, "a picture", MAX_FILE_BYTES), np.uint8)
+    values = cv2.imdecode(file, cv2.IMREAD_UNCHANGED)  # as stored
+    del file  # of noise, it has as many bytes as the values
     if values is None or values.dtype != np.uint16:
         raise DataError(f"{path}: picture: cannot be read to its end")
-    values = ((values.astype(np.uint32) * 255 + 32767) // 65535).astype(np.uint8)
+    values = _as_8_bit(values)
     if values.ndim == 2:
         values = values[..., None].repeat(3, axis=-1)
     if values.shape[2] == 2:  # grey and alpha
@@ -204,6 +205,17 @@ def _read_16_bit_colour(path: Path) -> np.ndarray:
     if values.shape[2] == 4:
         rgba[..., 3] = values[..., 3]
     return rgba
+
+
+def _as_8_bit(values: np.ndarray) -> np.ndarray:
+    """Return 16-bit values as 8-bit ones, a few rows at a time: 32-bit products of all of them would take
+    more memory than BYTES_DECODED allows."""
+    levels = np.empty(values.shape, np.uint8)
+    n_rows = max(BAND * len(values) // values.size, 1)
+    for first in range(0, len(values), n_rows):
+        rows = slice(first, first + n_rows)
+        levels[rows] = (values[rows].clip(0, 65535).astype(np.uint32) * 255 + 32767) // 65535
+    return levels
 
 
 def opencv(wanted: str, extra: str = "poses") -> Any:

@@ -4,8 +4,10 @@ the picture, and if a part of its pixels is decoded only."""
 from __future__ import annotations
 
 import struct
+import tracemalloc
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from PIL import Image, ImageCms
@@ -79,6 +81,17 @@ def test_large_pictures_are_decoded_by_fewer_threads(tmp_path: Path, monkeypatch
     assert (part, whole, none) == (1920 * 1280 * 16, 3840 * 2560 * 16, 1)
     assert decoding_bytes(paths[0]) == whole
     assert [threads.n_threads(n) for n in (part, whole, none, 10 * whole)] == [8, 4, 8, 1]
+
+
+@pytest.mark.parametrize("channels", [1, 3, 4])
+def test_16_bits_take_no_more_memory_than_is_planned_for(channels: int, tmp_path: Path) -> None:
+    path = tmp_path / "a.png"
+    cv2.imwrite(str(path), np.zeros((600, 800, channels), np.uint16))
+    tracemalloc.start()
+    read_picture(path)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < decoding_bytes(path)
 
 
 def profile_like(primaries: list[tuple[float, float, float]]) -> bytes:
