@@ -350,7 +350,7 @@ def test_a_missing_picture(tmp_path: Path):
 
 def test_a_name_too_long_is_a_missing_picture(tmp_path: Path):
     folder = make_folder(tmp_path / "a", 3)
-    edit(folder / "transforms.json", lambda d: d["frames"][1].update(file_path="x" * 5000))
+    edit(folder / "transforms.json", lambda d: d["frames"][1].update(file_path="x" * 4000))
     assert "frame 1 (xxx" in message(folder)
 
 
