@@ -75,11 +75,15 @@ def test_pictures_and_files_that_it_names_are_there() -> None:
 
 
 def test_version_is_the_same_everywhere() -> None:
+    from player.asset.manifest import VERSION
     from vfr_bake import __version__
+    from vfr_bake.training.model_file import VERSION as MODEL_VERSION
 
     project = (REPOSITORY / "pyproject.toml").read_text(encoding="utf-8")
     assert f'version = "{__version__}"' in project
     changelog = (REPOSITORY / "CHANGELOG.md").read_text(encoding="utf-8")
     assert f"## {__version__}" in changelog
+    asset, model = (".".join(map(str, version)) for version in (VERSION, MODEL_VERSION))
+    assert f"asset {asset} ([docs/format.md](docs/format.md)), model {model}." in changelog
     citation = (REPOSITORY / "CITATION.cff").read_text(encoding="utf-8")
     assert f"version: {__version__}\n" in citation
