@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 from player.errors import ConfigError
 
@@ -167,6 +167,8 @@ def _flag(key: str) -> str:
 
 
 def _check_ranges(options: ExportOptions) -> None:
+    if options.method is not None and options.method not in get_args(Method):
+        raise ConfigError(f"--method: expected one of {', '.join(get_args(Method))}, got {options.method}")
     for key, low, high in (
         ("faces", 1, None),
         ("points", 1, MAX_POINTS),

@@ -305,6 +305,8 @@ def test_options_of_every_format_are_checked() -> None:
     assert check_options(Path("x"), ExportOptions(format="exr", half=True)) == "exr"
     with pytest.raises(ConfigError, match="--decode does nothing for a ply mesh"):
         check_options(Path("x.ply"), ExportOptions(decode=True))
+    with pytest.raises(ConfigError, match="--method: expected one of baked, density, tsdf, got marching"):
+        check_options(Path("x.ply"), ExportOptions(method="marching"))  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("source", ["help", "docs"])
