@@ -65,6 +65,8 @@ class ServeSettings:
     """Gigabytes that an asset may take when it is opened for its page; half of the machine's if None."""
 
     def __post_init__(self) -> None:
+        if self.port is not None and not 1 <= self.port <= 65535:
+            raise ConfigError(f"port: expected 1 to 65535, got {self.port}")
         if self.samples is not None:
             object.__setattr__(self, "samples", checked_samples(self.samples))
         if self.quality is not None:
@@ -93,7 +95,7 @@ def serve(
     Raises:
         MissingExtraError: viser is not installed, or is one whose connections cannot be checked; or numba
             where it is asked for and does not run.
-        ConfigError: the address cannot be had.
+        ConfigError: there are no assets, or the address cannot be had.
         VfrError: of an asset that grows, not even the first part can be read.
 
     >>> import player
@@ -102,6 +104,8 @@ def serve(
     'http://127.0.0.1'
     """
     given = [assets] if isinstance(assets, Asset | Iterator) else assets
+    if not given:
+        raise ConfigError("assets: expected at least one, got none")
     firsts = [asset if isinstance(asset, Asset) else next(asset) for asset in given]
     for first in firsts:
         tell_what_is_missing(first, say)

@@ -175,6 +175,7 @@ def test_settings_of_the_viewer_are_checked_when_they_are_made() -> None:
     settings = ServeSettings(samples=np.int64(3), background=np.ones(3))  # type: ignore[arg-type]
     assert settings == ServeSettings(samples=3, background=(1.0, 1.0, 1.0))
     for wrong, message in (
+        ({"port": 70000}, "port: expected 1 to 65535, got 70000"),
         ({"samples": -1}, "samples: expected 0"),
         ({"quality": "best"}, "quality: expected exact, high or fast, got best"),
         ({"background": "white"}, "background: expected three numbers in 0"),
@@ -182,6 +183,8 @@ def test_settings_of_the_viewer_are_checked_when_they_are_made() -> None:
     ):
         with pytest.raises(ConfigError, match=message):
             ServeSettings(**wrong)
+    with pytest.raises(ConfigError, match="assets: expected at least one, got none"), serve([]):
+        pass
 
 
 def test_a_program_serves_as_the_command_does(asset: Asset, capfd: pytest.CaptureFixture[str]) -> None:
