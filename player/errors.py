@@ -22,7 +22,7 @@ class DataError(VfrError, ValueError):
 
 
 class FormatError(VfrError, ValueError):
-    """A file breaks its format: path, field, expected, got."""
+    """A file, or a camera made in a program, breaks its format: path or name, field, expected, got."""
 
 
 class VersionError(FormatError):

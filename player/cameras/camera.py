@@ -19,7 +19,7 @@ from player.files.json_files import brief
 
 @dataclass(frozen=True)
 class Camera:
-    """One pinhole camera.
+    """One pinhole camera. Raises FormatError for values that no pinhole camera has.
 
     >>> camera = Camera("front", np.eye(4), width=2, height=2, fx=1.0, fy=1.0, cx=1.0, cy=1.0)
     >>> rays_o, rays_d = camera.rays()
