@@ -46,4 +46,4 @@ class TrainingError(VfrError, RuntimeError):
 
 
 class MissingExtraError(VfrError, ImportError):
-    """A feature needs `pip install vfr-bake[extra]`."""
+    """A feature needs `pip install 'vfr-bake[extra]'`."""

@@ -42,7 +42,7 @@ def _parse(name: str, options: str, argv: Sequence[str] | None) -> Any:
     for package in ("torch", "numba", "tyro"):
         if find_spec(package) is None:
             raise MissingExtraError(
-                f"{package} is not installed: training and baking need: pip install vfr-bake[train]"
+                f"{package} is not installed: training and baking need: pip install 'vfr-bake[train]'"
             )
     import tyro
 

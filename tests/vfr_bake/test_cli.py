@@ -191,7 +191,7 @@ def test_eval_says_what_lpips_lacks_before_any_work(
 ) -> None:
     monkeypatch.setattr("vfr_bake.training.scores.lpips.find_spec", lambda name: None)
     assert eval_main([str(tmp_path / "none.pt"), "nowhere", "--lpips", "alex"]) == 1
-    one_error(capsys, "lpips is not installed", "pip install vfr-bake[lpips]")
+    one_error(capsys, "lpips is not installed", "pip install 'vfr-bake[lpips]'")
 
 
 def test_a_view_without_error_is_null_in_json(

@@ -50,7 +50,7 @@ def blur(image: np.ndarray) -> float:
     try:
         from skimage.measure import blur_effect
     except ImportError as error:
-        raise MissingExtraError("blur: needs scikit-image: pip install vfr-bake[train]") from error
+        raise MissingExtraError("blur: needs scikit-image: pip install 'vfr-bake[train]'") from error
     every = -(-max(image.shape[:2]) // SIDE)
     height, width = (side // every * every for side in image.shape[:2])
     if min(height, width) < SMALLEST * every:

@@ -137,7 +137,7 @@ def _layer_weights(network: str, n_channels: list[int]) -> list[torch.Tensor]:
     package = find_spec("lpips")
     if package is None or not package.submodule_search_locations:
         raise MissingExtraError(
-            "lpips is not installed: --lpips needs: pip install vfr-bake[lpips], or, without torchvision, "
+            "lpips is not installed: --lpips needs: pip install 'vfr-bake[lpips]', or, without torchvision, "
             "pip install --no-deps lpips"
         )
     path = Path(package.submodule_search_locations[0]) / "weights" / "v0.1" / f"{network}.pth"

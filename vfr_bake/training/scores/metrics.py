@@ -94,7 +94,7 @@ def ssim(a: np.ndarray, b: np.ndarray, seen: np.ndarray | None = None) -> float 
     try:
         from skimage.metrics import structural_similarity
     except ImportError as error:
-        raise MissingExtraError("ssim: needs scikit-image: pip install vfr-bake[train]") from error
+        raise MissingExtraError("ssim: needs scikit-image: pip install 'vfr-bake[train]'") from error
     if min(a.shape[:2]) < SSIM_WINDOW:
         return None
     border = SSIM_WINDOW // 2
