@@ -90,9 +90,10 @@ test-wheel: $(VENV)/.dev $(VENV)/.release system-libraries other-programs  ## bu
 	rm -rf build dist $(WHEEL)
 	$(BIN)/python -m build
 	$(BIN)/twine check --strict dist/*
-	@mkdir -p build; tar -tzf dist/*.tar.gz | sed 's|^[^/]*/||' | sort > build/packed; \
-	  missing=$$(git ls-files | grep -v '^\.' | sort | comm -23 - build/packed); rm build/packed; \
-	  test -z "$$missing" || { echo "not in the source package: $$missing" >&2; exit 1; }
+	@mkdir -p build; tar -tzf dist/*.tar.gz | sed 's|^[^/]*/||' | grep -vE '(^|/)$$|^(PKG-INFO|setup.cfg|.*\.egg-info/.*)$$' \
+	    | sort > build/packed; \
+	  differ=$$(git ls-files | grep -v '^\.' | sort | comm -3 - build/packed); rm build/packed; \
+	  test -z "$$differ" || { echo "in git or in the source package alone: $$differ" >&2; exit 1; }
 	$(PYTHON) -m venv $(WHEEL)
 	$(WHEEL_PIP) dist/*.whl
 	$(WHEEL_PIP) $(TOOLS_OF_TESTS)
