@@ -49,7 +49,7 @@ check: $(VENV)/.dev  ## style and types alone
 docs: $(VENV)/.docs  ## the manual as web pages, in build/docs
 	$(BIN)/python -m mkdocs build --strict --clean
 
-benchmarks: $(VENV)/.dev other-programs  ## every figure of the README and of docs/benchmarks.md: two and a half hours
+benchmarks: $(VENV)/.dev other-programs  ## the core set of the figures of the README and the manual: two and a half hours
 	$(BIN)/python -m tests.benchmarks
 
 # The tests that declare rows of the page are those that import Row.

@@ -1,4 +1,5 @@
-"""Measure every figure of the README and of docs/benchmarks.md anew, and render the pages with them.
+"""Measure the figures of the README and the manual anew, and render the pages with them: the core set, with
+`--all` the rest, too.
 
     python -m tests.benchmarks                        # the core set: what this commit and machine lack of it
     python -m tests.benchmarks --only bake_lego_fast  # some parts, and before them what they need

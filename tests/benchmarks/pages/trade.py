@@ -41,7 +41,7 @@ def _loss(row: Row) -> float:
 
 WISHES = (
     Wish(
-        "finals, and pictures that are compared",
+        "final pictures, and pictures that are compared with others",
         lambda row, ms: row["quality"] == "exact",
         lambda row, ms: (_loss(row), ms),
     ),
