@@ -142,11 +142,14 @@ def _add_shapes(group: argparse._ArgumentGroup) -> None:
         "--method", choices=get_args(Method), help="the baked mesh; marching cubes in all voxels; fused depth"
     )
     density, seconds = number("a density", "12.5"), number("seconds", "300")
-    value("--level", "X", "density of the surface, 1/model unit (half opaque: two voxels)", type=density)
+    level = "density at which the surface lies, 1/model unit (the one that absorbs half of the light over "
+    level += "two voxels or two march steps, whichever are longer)"
+    value("--level", "X", level, type=density)
     value("--texture", "N", "obj, glb: colours in a picture of N x N (needs xatlas)", type=texels)
     value("--time-limit", "S", "seconds that laying out a texture may take (300)", type=seconds)
     value("--points", "N", f"points of a cloud (.ply: no mesh; colmap: {POINTS:,})", type=cloud)
-    add("--colour", action="store_true", help="volume: colours too, of each place seen against its slope")
+    colour = "volume: also the colour of each vertex, seen along the density's gradient"
+    add("--colour", action="store_true", help=colour)
 
 
 def _add_pictures(group: argparse._ArgumentGroup) -> None:

@@ -86,7 +86,7 @@ class FieldConfig:
     activation: Activation = "gelu"
     """Between the head's layers."""
     view_encoding: ViewEncoding = "sh-features"
-    """How the head sees the direction: basis functions times predicted features (equation 4), or plain."""
+    """How the head sees the direction: basis functions times predicted features (equation 4), or alone."""
     sh_degree: int = 4
     """Bands of spherical harmonics in the view encoding: degree 4 means l = 0..3, 16 basis functions."""
     n_sh_features: int = 4
@@ -132,18 +132,18 @@ class FieldOptions:
     """Architecture as `vfr-train` takes it: what is not given follows from the kind of scene."""
 
     n_levels: int | None = None
-    """Levels of the hash grid, two feature channels each; 16 (paper: 32 for scenes, which
-    double the time of a CPU step)."""
+    """Levels of the hash grid, two feature channels each; 16 (paper: 32 for unbounded scenes,
+    which double the time of a CPU step)."""
     base_resolution: int | None = None
     """Cells per axis of the coarsest level; 16."""
     max_resolution: int | None = None
-    """Cells per axis of the finest level; objects 512 (over the box), scenes 2048 (over contracted space)."""
+    """Cells per axis of the finest level; objects 512 (over the box), unbounded scenes 2048 (contracted)."""
     log2_table_size: int | None = None
     """A level with more vertices than two to this power shares entries by hashing. CPU: 20, because places
     that share an entry disturb each other in views that are not learned from; up to 22 for an object whose
     pictures have more than 6 million pixels in all. GPU: 19, as in the paper."""
     density_width: int | None = None
-    """Hidden width of the density network, 0 for a linear map; objects 64, scenes 0, as in the paper."""
+    """Hidden width of the density network, 0 for a linear map; objects 64, unbounded scenes 0 (paper)."""
     compositing: Compositing = "features"
     """Sum features along the ray and evaluate the head once a pixel (volume feature rendering), or evaluate
     it at every sample and sum colours (standard volume rendering, the paper's baseline)."""
@@ -154,11 +154,11 @@ class FieldOptions:
     activation: Activation = "gelu"
     """Between the head's layers."""
     view_encoding: ViewEncoding = "sh-features"
-    """Spherical harmonics times features that the head predicts (equation 4 of the paper), or plain."""
+    """Spherical harmonics times features that the head predicts (the paper's equation 4), or alone."""
     sh_degree: int | None = None
-    """Bands of spherical harmonics: degree 4 means l = 0..3, 16 basis functions; objects 4, scenes 7."""
+    """Bands of spherical harmonics: degree 4 means l = 0..3, 16 functions; objects 4, unbounded scenes 7."""
     n_sh_features: int | None = None
-    """Features that multiply each basis function; objects 4, scenes 8, as in the paper."""
+    """Features that multiply each basis function; objects 4, unbounded scenes 8, as in the paper."""
 
     def resolved(self, unbounded: bool, device: str = "cpu", n_pixels: int = 0) -> FieldConfig:
         """Return the architecture with every open setting filled in. `n_pixels`: those of all pictures that
@@ -222,7 +222,7 @@ class TrainConfig:
 
     kind: SceneKind = "auto"
     """Object: a box, sampled through an occupancy grid. Unbounded: all of space, contracted. Auto: an object
-    if the pictures have alpha or a plain background."""
+    if at least half of the pictures have transparent pixels, or if the background is plain."""
     device: Device = "auto"
     """Where to train: a GPU that CUDA runs on, or the CPU. Auto: the GPU if there is one."""
     max_side: int | None = None
@@ -236,11 +236,11 @@ class TrainConfig:
     then in the unit of that distance, metres for glTF and USD, in every export. Pictures alone do not tell
     how large anything is."""
     effort: Effort = "good"
-    """How long a training may take on a CPU: draft 2 minutes, good 10 (scenes 12), best 60. It ends earlier
-    when the error on pixels that it does not learn from is flat. A GPU takes its steps, a draft 2 minutes."""
+    """How long a training may take on a CPU: draft 2 minutes, good 10 (unbounded scenes 12), best 60. It ends
+    earlier when the error on pixels not learned from is flat. A GPU takes its steps, a draft 2 minutes."""
     steps: int | None = None
     """Optimiser steps: so many are taken if the minutes allow it. CPU: as many as they allow; GPU: 20,000
-    (scenes 40,000) with far larger batches, as in the paper."""
+    (unbounded scenes 40,000) with far larger batches, as in the paper."""
     minutes: float | None = None
     """Minutes at most, instead of those of the effort; the learning-rate schedule runs on whichever of steps
     and minutes is further."""
@@ -250,8 +250,8 @@ class TrainConfig:
     26.3 dB in steps of 16,384, 27.1 in steps of 8,192 and 27.8 in steps of 4,096. On a CPU it grows to
     twice as many from step 6,000 on."""
     batch_rays: int | None = None
-    """Scenes: rays in a batch; GPU 8,192, CPU 512, for the same reason. On a CPU it grows to four times as
-    many from step 2,000 on."""
+    """Unbounded scenes: rays in a batch; GPU 8,192, CPU 512, for the same reason. On a CPU it grows to four
+    times as many from step 2,000 on."""
     max_rays: int | None = None
     """Objects: rays in a batch at most, however few samples they need; GPU 65,536, CPU 16,384."""
     grid_rate: float | None = None
@@ -259,8 +259,8 @@ class TrainConfig:
     network_rate: float | None = None
     """Adam learning rate of the density network and the head; GPU 0.01, as in the paper, CPU 0.004."""
     pilot_steps: int | None = None
-    """First steps, in which a small pilot network renders colours sample by sample (section 3.3 of the
-    paper); 300, but no more than a quarter of the training."""
+    """Number of the first steps, in which a small pilot network renders colours sample by sample (section 3.3
+    of the paper); 300, but no more than a quarter of the training."""
     step_cells: float = 3.0
     """Objects: length of a march step in training, in cells of the finest level; steps of pictures are half
     as long. Longer steps leave room for more rays in a batch: lego after 1,500 steps had 22.4 dB with 1.4
@@ -269,18 +269,18 @@ class TrainConfig:
     """Objects: cells per axis of the occupancy grid."""
     distortion: float | None = None
     """Weight of the distortion loss (mip-NeRF 360), which draws the weights of a ray together: objects 0.05,
-    within a hundredth of the box; scenes 0.002, where five times as much puts fog before surfaces of one
-    colour."""
+    within a hundredth of the box; unbounded scenes 0.002, where five times as much puts fog before surfaces
+    of one colour."""
     near_gradients: float = 2.0
-    """Scenes: what is nearer to a camera than this learns more slowly, by the square of its distance, so that
-    no fog settles before the cameras; model units, in which nine in ten cameras are nearer than 1; 0: all
-    learn alike."""
+    """Unbounded scenes: what is nearer to a camera than this learns more slowly, by its squared distance, so
+    that no fog settles before the cameras; model units, in which nine in ten cameras are nearer than 1; 0:
+    all learn alike."""
     seed: int = 0
     """Seed of every random number."""
     eval_views: int | None = None
-    """Test views rendered at the end, spread evenly; 0 for none. Objects 10, scenes 3, a view of which takes
-    half a minute; fewer if they would take more than a fifth of the training's time. `vfr-eval` renders them
-    all."""
+    """Test views rendered at the end, spread evenly; 0 for none. Objects 10, unbounded scenes 3, a view of
+    which takes half a minute; fewer if they would take more than a fifth of the training's time. `vfr-eval`
+    renders them all."""
     checkpoint_minutes: float = 2.0
     """Minutes between two checkpoints, kept beside the model file until training is complete."""
     field: FieldOptions = field(default_factory=FieldOptions)
@@ -337,7 +337,7 @@ class BakeConfig:
     """Settings of the bake. Those that are not given follow from the preset."""
 
     preset: Preset = "balanced"
-    """Fidelity: all but the model's own pictures, for finals. Balanced: small and quick to play. Fast: fewer
+    """Fidelity: for final pictures, nearly the model's own. Balanced: small and quick to play. Fast: fewer
     bytes and a smaller head. Phone: the fewest bytes, for pages on phones."""
     resolution: int | None = None
     """Cells per axis of the baked densities, at most half again the field's finest level."""
@@ -345,8 +345,8 @@ class BakeConfig:
     """Cells per axis of the baked features, at most the field's finest level and no more than the densities
     have. Not given: the preset's share of those."""
     n_channels: int | None = None
-    """Feature channels kept of the field's, exactly; the projection is folded into the head. Not given: as
-    few as the preset's loss allows."""
+    """Exact number of feature channels to store; the projection to them is folded into the head. Not given:
+    as few as the preset's loss allows."""
     k: int | Literal["auto"] = "auto"
     """Feature lookups per ray, exactly; 0 looks up every sample. Auto: as few as the preset's loss allows.
     The player can be asked for another number."""
@@ -354,7 +354,7 @@ class BakeConfig:
     """A cell is stored if some view gives one of its samples at least this weight. Not given: the highest of
     a few that loses next to nothing on training pixels, or none; 0.01 for an unbounded scene."""
     no_cull: bool = False
-    """Store what no view sees as well: every cell that the model holds matter in."""
+    """Store every cell in which the model may hold matter, also where no view sees it."""
     code_levels: int | None = None
     """Largest feature code, 7 to 127: fewer levels take fewer bytes."""
     head_width: int | None = None
@@ -378,11 +378,11 @@ class BakeConfig:
     """Take no wider a head and no more lookups than a frame of 800x800 in so many milliseconds allows,
     measured by the player on this machine; fail, and write nothing, if it takes longer all the same."""
     max_memory: float | None = None
-    """Gigabytes of memory that the bake may take: rays that are learned from and cells that are stored follow
-    from it. Not given: 4, or half of the machine's memory if that is less."""
+    """Gigabytes of memory that the bake may take: with less, the bake learns from fewer rays and its grids
+    are coarser. Not given: 4, or half of the machine's memory if that is less."""
     check_views: int = 4
     """Views between the training cameras on which each step of the bake is compared with the model's own
-    pictures; 1 to 1,000, of which many have fewer pixels each."""
+    pictures; 1 to 1,000; the more views, the fewer pixels of each are compared."""
 
     def __post_init__(self) -> None:
         check(self, "preset", self.preset in PRESETS, f"one of {tuple(PRESETS)}")

@@ -107,8 +107,8 @@ class Eval:
     """Gigabytes of memory that reading the model may take; half of the machine's if not given."""
     pictures: Path | None = None
     """Also write photograph | rendered | error map of every view to this folder, replacing files of equal
-    name; it has to lie outside the data set. The error map is black for none, white for a difference of a
-    quarter of the range or more."""
+    name; it has to lie outside the data set. The error map is black where nothing differs, white where the
+    difference is a quarter of the range or more."""
 
 
 @dataclass(frozen=True, kw_only=True)
