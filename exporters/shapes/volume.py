@@ -79,6 +79,15 @@ class Volume:
         shift[:3, 3] = -0.5
         return replace(self, matrix=self.matrix @ shift)
 
+    def with_margin(self) -> Volume:
+        """Return the same volume with indices of 1 or more, so that there is a voxel before the first. They
+        are higher by 8 if one was 0, so that the bricks of 8 x 8 x 8 stay as they are."""
+        if self.index.min(initial=1):
+            return self
+        shift = np.eye(4)
+        shift[:3, 3] = -8
+        return replace(self, index=self.index + np.int32(8), matrix=self.matrix @ shift)
+
     def points(self) -> np.ndarray:
         """Return the places of the vertices in the frame, [n, 3] float64."""
         return self.index @ self.matrix[:3, :3].T + self.matrix[:3, 3]

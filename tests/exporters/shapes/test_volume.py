@@ -215,6 +215,22 @@ def test_bad_volumes() -> None:
         Volume(np.zeros((1, 3), np.int32), np.zeros(2, np.float32), None, np.eye(4))
 
 
+def test_colours_are_a_voxel_wider_at_the_edge_of_the_grid_too(
+    block_asset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Vertices with an index of 0 get a colour before them; places, densities and colours stay."""
+    index = np.array([[0, 3, 9], [1, 3, 9]], np.int32)
+    matrix = np.diag([0.5, 2, 1, 1])
+    volume = Volume(index, np.array([3, 4], np.float32), np.full((2, 3), 128, np.uint8), matrix)
+    monkeypatch.setattr(export, "asset_volume", lambda *_: (volume, 0.0))
+    export.export_asset(block_asset, tmp_path / "a.vdb", ExportOptions(colour=True))
+    grids = parse_vdb((tmp_path / "a.vdb").read_bytes(), "")
+    for name, low, high in (("density", [0, 6, 9], [0.5, 6, 9]), ("color", [-0.5, 4, 8], [1, 8, 10])):
+        grid = grids[name]
+        places = grid.index @ grid.matrix[:3, :3].T + grid.matrix[:3, 3]
+        assert places.min(axis=0).tolist() == low and places.max(axis=0).tolist() == high
+
+
 def test_crop_and_what_it_prints(
     block_asset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
