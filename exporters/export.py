@@ -130,6 +130,8 @@ def _volume(
     check_volume_bytes(f".{name}", data, written, str(target))
     places = np.c_[volume.points(), np.ones(len(volume.index))] @ np.linalg.inv(matrix).T
     facts = {
+    if name == "vdb" and options.colour:  # whose grid of colours is a voxel wider
+        written = written.with_margin()
         "voxels": len(volume.index),
         "level": volume.level,
         "densities": [float(volume.density.min()), float(volume.density.max())],
