@@ -172,6 +172,7 @@ def _sentence(summary: dict[str, Any]) -> str:
     if "inputs" in summary:
         counts.append(f"{', '.join(summary['inputs'])} -> {', '.join(summary['outputs'])}")
     parts = [*counts, f"{summary['bytes'] / 1e6:.1f} MB"]
+    parts += summary.get("notes", [])
     if "viewer_bytes" in summary:
         parts.append(f"{summary['viewer_bytes'] / 1e3:.0f} kB of it the viewer")
         parts.append(f"{summary['gpu_bytes'] / 1e6:.0f} MB of graphics memory")

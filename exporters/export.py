@@ -8,6 +8,7 @@ target's name appears.
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -65,8 +66,9 @@ def export_asset(
         `bytes` of each level). A surface that was made again: `method`, `unseen_faces_removed`,
         `haze_faces_removed`, `floaters_removed`, `floater_faces_removed`. Volumes: `voxels`, `densities`
         (their range) and `level` (half opaque over a voxel), 1/unit of the frame. Others: `points`;
-        `cameras`; `pictures`, `channels`; `inputs`, `outputs`; for a page `viewer_bytes` (all but the scene's
-        data and the poster) and `gpu_bytes`.
+        `cameras`; `pictures`, `channels` and, if something of the cameras is ignored, `notes` (lines);
+        `inputs`, `outputs`; for a page `viewer_bytes` (all but the scene's data and the poster) and
+        `gpu_bytes`.
 
     Raises:
         ConfigError: an unknown suffix, a setting that does nothing or is out of range, an empty crop, an
@@ -97,11 +99,13 @@ def export_asset(
     if is_mesh:
         facts = export_mesh(asset, target, options, name, matrix, report)
     elif name == "exr":
-        cameras, names = _views(asset, options)
+        notes: list[str] = []
+        cameras, names = _views(asset, options, notes.append)
         progress = partial(report, "picture")
         facts = export_pictures(
             asset, target, cameras, names, options.half, force, options.max_memory, progress
         )
+        facts |= {"notes": notes} if notes else {}
     elif name in ("html", "web"):
         facts = export_page(asset, target, name, options.max_gpu_mb, force)
     elif name == "colmap":
@@ -126,12 +130,12 @@ def _volume(
     box = None if options.crop is None else parse_crop(options.crop)
     volume, removed = asset_volume(asset, matrix, box, options.colour)
     written = volume.for_blender() if (name, options.frame) == ("vdb", "blender") else volume
+    if name == "vdb" and options.colour:  # whose grid of colours is a voxel wider
+        written = written.with_margin()
     data = npz.npz_bytes(volume, options.coordinates) if name == "npz" else vdb.vdb_bytes(written)
     check_volume_bytes(f".{name}", data, written, str(target))
     places = np.c_[volume.points(), np.ones(len(volume.index))] @ np.linalg.inv(matrix).T
     facts = {
-    if name == "vdb" and options.colour:  # whose grid of colours is a voxel wider
-        written = written.with_margin()
         "voxels": len(volume.index),
         "level": volume.level,
         "densities": [float(volume.density.min()), float(volume.density.max())],
@@ -189,11 +193,13 @@ def _cloud(
     return cloud, {"points": len(cloud.vertices), "bounds": bounds_of(cloud), **facts}
 
 
-def _views(asset: Asset, options: ExportOptions) -> tuple[list[Camera], list[str]]:
+def _views(
+    asset: Asset, options: ExportOptions, say: Callable[[str], object]
+) -> tuple[list[Camera], list[str]]:
     """Return the cameras to render and the names of their files, which `vfr-play` would give them, too."""
     width, height = asset.manifest.view_size
     given = options.cameras
-    cameras = asset_cameras(asset) if given is None else read_views(given, (width, height))
+    cameras = asset_cameras(asset) if given is None else read_views(given, (width, height), say)
     part = options.views or slice(None)
     cameras, names = cameras[part], frame_names(cameras)[part]
     return ([c.fitted(*options.size) for c in cameras] if options.size else cameras), names

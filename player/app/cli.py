@@ -163,7 +163,7 @@ def _views(asset: Asset, arguments: argparse.Namespace) -> list[Camera]:
 
     width, height = asset.manifest.view_size
     file = arguments.cameras
-    cameras = asset_cameras(asset) if file is None else read_views(file, (width, height))
+    cameras = asset_cameras(asset) if file is None else read_views(file, (width, height), _say)
     if arguments.orbit is not None:
         return orbit(cameras, arguments.orbit, arguments.size or (width, height))
     if arguments.view is not None:

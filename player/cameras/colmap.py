@@ -9,7 +9,7 @@ pixel centre is at +0.5 as here. Of the text form, `cameras.txt` and `images.txt
 from __future__ import annotations
 
 import struct
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -86,12 +86,12 @@ def _n_images(path: Path) -> int:
         return int.from_bytes(file.read(8), "little")
 
 
-def read_views(model: Path) -> list[Camera]:
+def read_views(model: Path, say: Callable[[str], object] = lambda text: None) -> list[Camera]:
     """Read the registered pictures of a COLMAP model as pinhole cameras, in the order of their names.
 
     `model`: the folder of `cameras.bin` and `images.bin`, or of `cameras.txt` and `images.txt`. Lens
-    distortion is ignored, as is right for pictures that were undistorted. Raises FormatError, DataError (a
-    camera model that is no pinhole).
+    distortion is ignored, as is right for pictures that were undistorted; `say` is then called with a line.
+    Raises FormatError, DataError (a camera model that is no pinhole).
     """
     suffix = "bin" if (model / "images.bin").exists() else "txt"
     if suffix == "bin":
@@ -100,13 +100,16 @@ def read_views(model: Path) -> list[Camera]:
         lenses, images = _text_cameras(model / "cameras.txt"), _text_images(model / "images.txt")
     if not images:
         raise FormatError(f"{model}: images.{suffix}: expected at least one picture, got none")
-    views = []
+    views, n_distorted = [], 0
     for image in sorted(images, key=lambda image: image.name):
         if image.camera_id not in lenses:
             raise FormatError(f"{model}: {image.name}: camera {image.camera_id} is not in cameras.{suffix}")
         lens = lenses[image.camera_id]
         size = (lens.width, lens.height)
         views.append(Camera(image.name, image.c2w, *size, lens.fx, lens.fy, lens.cx, lens.cy))
+        n_distorted += any(lens.distortion.values())
+    if n_distorted:
+        say(f"{model}: lens distortion of {n_distorted} of {len(views)} cameras is ignored")
     return views
 
 

@@ -27,6 +27,8 @@ MAX_NAME_PARTS = 16
 """The most folders and stem that become the name of a frame's file."""
 _UNWRITABLE = re.compile("[\0-\x1f\x7f\x85\u2028\u2029\ud800-\udfff]")
 """Characters that cannot be in a file name: control characters, line ends and halves of surrogate pairs."""
+DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
+"""Keys of OpenCV's coefficients of lens distortion."""
 PINHOLE_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "RADIAL", "SIMPLE_RADIAL")
 
 
@@ -112,6 +114,16 @@ def transforms_cameras(
         _frame_camera(document, frame, f"{where}: frame {index} ({brief(frame['file_path'])})", size)
         for index, (frame, size) in enumerate(zip(frames, sizes or [None] * len(frames), strict=True))
     ]
+
+
+def is_distorted(document: dict[str, Any], frame: dict[str, Any]) -> bool:
+    """Return whether the camera of a frame has lens distortion: a coefficient, its own or that at the top of
+    the document, that is not 0.
+
+    >>> is_distorted({"k1": 0.1}, {"k1": 0}), is_distorted({"k1": 0.1}, {})
+    (False, True)
+    """
+    return any(frame.get(key, document.get(key)) for key in DISTORTION)
 
 
 def transforms_number(document: dict[str, Any], frame: dict[str, Any], key: str, where: str) -> float | None:

@@ -2,26 +2,31 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 from player.asset.asset import Asset
 from player.cameras import colmap
 from player.cameras.camera import Camera
 from player.cameras.nerfstudio import is_camera_path, path_cameras, path_frame_rate
-from player.cameras.transforms import parse_transforms, transforms_cameras
+from player.cameras.transforms import is_distorted, parse_transforms, transforms_cameras
 from player.errors import FormatError
 from player.files.json_files import parse_json, read_json
 
 EXPECTED = "a transforms.json, a camera_path.json or the folder of a COLMAP model"
 
 
-def read_views(path: str | Path, size: tuple[int, int] | None = None) -> list[Camera]:
-    """Read the cameras of a file, in the file's order; those of COLMAP in the order of their names.
+def read_views(
+    path: str | Path, size: tuple[int, int] | None = None, say: Callable[[str], object] = lambda text: None
+) -> list[Camera]:
+    """Read the cameras of a file as pinhole cameras, in the file's order; those of COLMAP in the order of
+    their names.
 
     Args:
         path: a transforms.json, a nerfstudio camera_path.json, or a COLMAP model: its folder, the folder
             above, or one of its files.
         size: (width, height) in pixels of cameras for which the file has no size.
+        say: called with a line if cameras have lens distortion, which pinhole cameras do not have.
 
     Raises:
         FormatError: file, frame, expected, got.
@@ -33,13 +38,16 @@ def read_views(path: str | Path, size: tuple[int, int] | None = None) -> list[Ca
     path = Path(path)
     model = _colmap_model(path)
     if model is not None:
-        return colmap.read_views(model)
+        return colmap.read_views(model, say)
     data = read_json(path, EXPECTED)
     document = parse_json(data, str(path))
     if is_camera_path(document):
         return path_cameras(document, path)
     document = parse_transforms(data, str(path))
-    return transforms_cameras(document, path, [size] * len(document["frames"]))
+    frames = document["frames"]
+    if n_distorted := sum(is_distorted(document, frame) for frame in frames):
+        say(f"{path}: lens distortion of {n_distorted} of {len(frames)} cameras is ignored")
+    return transforms_cameras(document, path, [size] * len(frames))
 
 
 def asset_cameras(asset: Asset) -> list[Camera]:

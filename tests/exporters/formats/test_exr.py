@@ -157,13 +157,14 @@ def test_folder_of_pictures(shells_asset: Path, tmp_path: Path, capsys: pytest.C
     assert sorted(path.name for path in tmp_path.iterdir()) == ["frames"]
 
 
-def test_cameras_of_a_file(shells_asset: Path, tmp_path: Path) -> None:
+def test_cameras_of_a_file(shells_asset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     given = tmp_path / "transforms.json"
-    given.write_bytes((shells_asset / "cameras.json").read_bytes())
+    given.write_text(json.dumps({**json.loads((shells_asset / "cameras.json").read_text()), "k1": 0.1}))
     target = tmp_path / "frames"
     target.mkdir()  # empty: nothing is lost
     arguments = [str(shells_asset), str(target), "--format", "exr", "--views", "4", "--size", "9x7"]
     assert cli.main([*arguments, "--cameras", str(given)]) == 0
+    assert f"{given}: lens distortion of 5 of 5 cameras is ignored" in capsys.readouterr().out
     assert [path.name for path in target.iterdir()] == ["r_4.exr"]
     wide = tmp_path / "wide"
     assert cli.main([str(shells_asset), str(wide), "--format", "exr", "--views", "4", "--size", "48x20"]) == 0

@@ -52,6 +52,17 @@ def test_one_picture_a_frame_and_figures(
     assert printed.err == "" and printed.out.count("\n") == 1 and str(out) in printed.out
 
 
+def test_lens_distortion_of_cameras_is_named(
+    shells_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    given = tmp_path / "given.json"
+    given.write_text(json.dumps({**json.loads((shells_folder / "cameras.json").read_text()), "k1": 0.1}))
+    options = ["--cameras", str(given), "--frames", "0", "--output", str(tmp_path / "a.png")]
+    assert cli.main([str(shells_folder), *options]) == 0
+    said = f"vfr-play: {given}: lens distortion of 5 of 5 cameras is ignored\n"
+    assert capsys.readouterr().err == said
+
+
 def test_json_on_stdout_and_slices(
     shells_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -202,6 +203,32 @@ def test_colmap_views(form: str, place: str, model: Path, shells_folder: Path) -
         for key in ("width", "height", "fx", "fy", "cx", "cy"):
             assert getattr(read, key) == pytest.approx(getattr(camera, key))
     assert frame_rate(where) is None
+
+
+@pytest.mark.parametrize("suffix", ["bin", "txt"])
+def test_colmap_s_lens_distortion_is_named(suffix: str, model: Path) -> None:
+    said: list[str] = []
+    read_views(model, say=said.append)
+    assert not said
+    text = (model / "cameras.txt").read_text()
+    (model / "cameras.txt").write_text(re.sub(r"PINHOLE (.*)", r"OPENCV \1 0 0 0 0.001", text))
+    if suffix == "bin":
+        pycolmap.Reconstruction(str(model)).write_binary(str(model))
+    n_views = len(read_views(model, say=said.append))
+    assert said == [f"{model}: lens distortion of {n_views} of {n_views} cameras is ignored"]
+
+
+@pytest.mark.parametrize("key", ["k1", "k2", "k3", "k4", "p1", "p2"])
+def test_lens_distortion_of_a_transforms_json_is_named(key: str, tmp_path: Path) -> None:
+    """A coefficient at the top is that of every frame without its own; 0 is none."""
+    frame = {"file_path": "a", "transform_matrix": np.eye(4).tolist()}
+    document = {"w": 8, "h": 6, "fl_x": 9, "frames": [frame, {**frame, key: 0}, {**frame, key: -0.1}]}
+    said: list[str] = []
+    read_views(write(tmp_path, json.dumps(document)), say=said.append)
+    assert said == [f"{tmp_path / 'camera_path.json'}: lens distortion of 1 of 3 cameras is ignored"]
+    path = write(tmp_path, json.dumps({**document, key: 0.1}))
+    read_views(path, say=said.append)
+    assert said[1:] == [f"{path}: lens distortion of 2 of 3 cameras is ignored"]
 
 
 def test_real_colmap(can: Path) -> None:
