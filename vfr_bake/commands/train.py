@@ -151,7 +151,8 @@ def _check(options: Any) -> int:
     from vfr_bake.data.check.check import check_data
     from vfr_bake.data.check.page import MARK, check_page
 
-    page = options.html or Path(f"{Path(options.data).resolve().stem}_check.html")
+    data = Path(options.data).resolve()
+    page = options.html or Path(f"{data.name if data.is_dir() else data.stem}_check.html")
     check_page_target(page, options.force, MARK)
     check_json_target(options.json, [], page)
     with Bar("looking") as bar:

@@ -12,6 +12,7 @@ import pytest
 import torch
 
 from player.errors import OutputError
+from tests.vfr_bake.data.check.test_check import walk
 from vfr_bake.cli import train_main
 from vfr_bake.data.files.masks import stray_masks
 from vfr_bake.data.poses import PoseReport
@@ -28,6 +29,18 @@ SMALL = [
 
 def interrupt(*_: Any) -> None:
     raise KeyboardInterrupt
+
+
+def test_the_page_of_a_check_has_the_whole_name_of_the_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    folder = walk(tmp_path / "2024.05.garden", 2)
+    shutil.make_archive("2024.06.garden", "zip", folder)
+    for name in ("2024.05.garden/", "2024.06.garden.zip"):
+        assert train_main([name, "--check"]) == 0
+    pages = sorted(path.name for path in tmp_path.glob("*.html"))
+    assert pages == ["2024.05.garden_check.html", "2024.06.garden_check.html"]
 
 
 def test_masks_of_no_picture_are_told_of_once(
