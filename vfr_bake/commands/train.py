@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 import sys
 import time
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Iterator
+from dataclasses import fields, is_dataclass, replace
 from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -39,6 +39,9 @@ N_LEARNED = 10_000
 GLANCED_AT = 24
 """Most pictures that a run looks at before it begins; `--check` looks at as many as ten seconds allow."""
 
+USED_BY_CHECK = ("data", "check", "html", "force", "json", "max_side", "downscale")
+"""The options that have an effect with `--check`."""
+
 
 def train_command(options: Any) -> int:
     """Train, or look at the pictures alone, as `options` says (`vfr_bake.options.Train`); return the exit
@@ -48,11 +51,11 @@ def train_command(options: Any) -> int:
     from vfr_bake.training.processes import Processes
     from vfr_bake.training.trainer import Trainer
 
+    if wrong := _misused(options):
+        _say(wrong)
+        return 2
     if options.check:
         return _check(options)
-    if options.model is None:
-        _say("expected a model file to write, or --check; see vfr-train --help")
-        return 2
     checkpoint = checkpoint_path(options.model)
     goes_on = options.resume and checkpoint.exists()
     check_model_target(options.model, options.force or goes_on)
@@ -95,6 +98,28 @@ def train_command(options: Any) -> int:
         stopped = _finish(options, trainer, scene, figures, stopped)
     processes.leave()
     return 130 if stopped else 0
+
+
+def _misused(options: Any) -> str:
+    """Return what is wrong with the options together; nothing if they fit."""
+    if not options.check:
+        if options.model is None:
+            return "expected a model file to write, or --check; see vfr-train --help"
+        return "" if options.html is None else "--html: does nothing without --check"
+    if options.model is not None:
+        return printable(f"{options.model}: expected no model file with --check, which trains nothing")
+    lost = [name for name in _given(options) if name not in USED_BY_CHECK]
+    return f"--{lost[0].replace('_', '-')}: does nothing with --check, which trains nothing" if lost else ""
+
+
+def _given(settings: Any) -> Iterator[str]:
+    """Yield the names of the settings, and of those within them, that are not what they are by default."""
+    for field in fields(settings):
+        value = getattr(settings, field.name)
+        if is_dataclass(value):
+            yield from _given(value)
+        elif value != field.default:
+            yield field.name
 
 
 def _finish(options: Any, trainer: Trainer, scene: Scene, figures: dict[str, Any], interrupted: bool) -> bool:

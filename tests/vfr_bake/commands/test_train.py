@@ -31,6 +31,33 @@ def interrupt(*_: Any) -> None:
     raise KeyboardInterrupt
 
 
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["MODEL", "--html", "page.html"], "--html: does nothing without --check"),
+        (["MODEL", "--check"], "model.pt: expected no model file with --check, which trains nothing"),
+        *(
+            (["--check", "--max-side", "240", *words], f"{words[0]}: does nothing with --check")
+            for words in (
+                ["--resume"],
+                ["--preview"],
+                ["--no-cache"],
+                ["--steps", "5"],
+                ["--head-width", "16"],
+                ["--scale", "a", "b", "1"],
+            )
+        ),
+    ],
+)
+def test_options_that_do_nothing_are_refused(
+    options: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = [str(tmp_path / "model.pt") if word == "MODEL" else word for word in options]
+    assert train_main([str(tmp_path), *words]) == 2
+    (told,) = capsys.readouterr().err.splitlines()
+    assert message in told and list(tmp_path.iterdir()) == []
+
+
 def test_the_page_of_a_check_has_the_whole_name_of_the_folder(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
