@@ -48,8 +48,9 @@ def train_command(options: Any) -> int:
     code."""
     from vfr_bake.data import load_scene, training_reader
     from vfr_bake.training.checkpoint import checkpoint_path, load_checkpoint
+    from vfr_bake.training.preview import preview_path
     from vfr_bake.training.processes import Processes
-    from vfr_bake.training.trainer import Trainer
+    from vfr_bake.training.trainer import Trainer, choose_device
 
     if wrong := _misused(options):
         _say(wrong)
@@ -60,7 +61,10 @@ def train_command(options: Any) -> int:
     goes_on = options.resume and checkpoint.exists()
     check_model_target(options.model, options.force or goes_on)
     check_json_target(options.json, [], options.model)
+    if options.preview:
+        check_target(preview_path(options.model), options.force or options.resume, is_file=True)
     config = options.config
+    choose_device(config.device)  # reports at once that there is no GPU, not after the cameras
     processes = Processes.from_environment()
     if options.resume and not goes_on and processes.first:
         _say(f"{checkpoint}: no such checkpoint: training begins anew")
@@ -291,7 +295,6 @@ def _preview(options: Any, scene: Scene) -> Preview:
     from vfr_bake.training.preview import Preview, preview_path
 
     path = preview_path(options.model)
-    check_target(path, options.force or options.resume, is_file=True)
     _say(f"look at {printable(str(path))}, new every minute")
     return Preview(scene, path)
 

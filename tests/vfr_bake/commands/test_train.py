@@ -58,6 +58,28 @@ def test_options_that_do_nothing_are_refused(
     assert message in told and list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--preview"], "model.preview.png: already exists: add --force"),
+        (["--device", "cuda"], "device: expected a GPU"),
+    ],
+)
+def test_what_is_sure_to_end_a_training_is_told_before_any_work(
+    options: list[str],
+    message: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """The data, which are not there, would be missed next."""
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    (tmp_path / "model.preview.png").write_bytes(b"")
+    assert train_main([str(tmp_path / "no data"), str(tmp_path / "model.pt"), *options]) == 1
+    (told,) = capsys.readouterr().err.splitlines()
+    assert message in told
+
+
 def test_the_page_of_a_check_has_the_whole_name_of_the_folder(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
