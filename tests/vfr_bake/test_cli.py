@@ -22,7 +22,7 @@ from PIL import Image
 from player.asset.asset import Asset
 from player.errors import DataError
 from vfr_bake.cli import bake_main, eval_main, train_main
-from vfr_bake.commands.train import EVAL_VIEWS, _test_figures, _with_cameras
+from vfr_bake.commands.train import EVAL_VIEWS, _as_folder, _find_cameras, _test_figures
 from vfr_bake.config import EFFORT_MINUTES, TrainConfig
 from vfr_bake.data import load_scene
 from vfr_bake.data.poses import PoseReport
@@ -440,13 +440,19 @@ def test_a_folder_called_demo_is_not_the_built_in_scene(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     shutil.copytree(small_data, tmp_path / "demo")
-    assert (_with_cameras("./demo"), _with_cameras("demo/")) == ("./demo", "demo/")
-    assert _with_cameras("demo") == "demo"
+    assert [_as_folder(name, print) for name in ("./demo", "demo/", "demo")] == ["./demo", "demo/", "demo"]
     for name in ("transforms_train.json", "transforms_test.json"):
         (tmp_path / "demo" / name).unlink()
-    report = PoseReport(Path("demo"), 12, 12, 0.5, 3.0)
-    monkeypatch.setattr("vfr_bake.data.poses.estimate_cameras", lambda *arguments: report)
-    assert _with_cameras("./demo") == "./demo"
+    estimated = []
+
+    def estimate(folder: Path, *_: object) -> PoseReport:
+        estimated.append(folder)
+        return PoseReport(folder, 12, 12, 0.5, 3.0)
+
+    monkeypatch.setattr("vfr_bake.data.poses.estimate_cameras", estimate)
+    for name in ("demo", "./demo"):
+        _find_cameras(name, print, None)
+    assert estimated == [Path("demo")]
 
 
 def test_what_is_masked_in_training_is_masked_in_vfr_eval(small_data: Path, tmp_path: Path) -> None:

@@ -68,15 +68,12 @@ def train_command(options: Any) -> int:
     processes = Processes.from_environment()
     if options.resume and not goes_on and processes.first:
         _say(f"{checkpoint}: no such checkpoint: training begins anew")
-    # The pictures of a ZIP or a video can be looked at only once they are unpacked.
-    packed = not Path(options.data).is_dir()
-    glance = _glance(options.data, config) if processes.first and not packed else None
     # Masks of no picture are found when cameras are estimated, and again when the pictures are read. What has
     # been said is kept, and is not said again.
     say = cache(partial(_tell, options.data))
-    data = processes.in_turn(lambda: _with_cameras(options.data, say, config.scale))
-    if processes.first and packed:
-        glance = _glance(data, config)
+    data = processes.in_turn(lambda: _as_folder(options.data, say))
+    glance = _glance(data, config) if processes.first else None
+    processes.in_turn(lambda: _find_cameras(data, say, config.scale))
     if glance is not None:
         glance()  # the pictures are bad, but their cameras were found nevertheless
     told = say if processes.first else None
@@ -95,11 +92,12 @@ def train_command(options: Any) -> int:
         if processes.first:
             _say(f"going on after step {trainer.next_step}")
     preview = _preview(options, scene) if options.preview and processes.first else None
-    figures = _train_steps(trainer, checkpoint, preview)
-    figures["blurred"] = blurred
-    stopped = figures.pop("interrupted")
-    if processes.first:
-        stopped = _finish(options, trainer, scene, figures, stopped)
+    with CtrlC() as ctrl_c:
+        figures = _train_steps(trainer, checkpoint, preview, ctrl_c)
+        figures["blurred"] = blurred
+        stopped = figures.pop("interrupted")
+        if processes.first:
+            stopped = _finish(options, trainer, scene, figures, stopped, ctrl_c)
     processes.leave()
     return 130 if stopped else 0
 
@@ -126,11 +124,19 @@ def _given(settings: Any) -> Iterator[str]:
             yield field.name
 
 
-def _finish(options: Any, trainer: Trainer, scene: Scene, figures: dict[str, Any], interrupted: bool) -> bool:
+def _finish(
+    options: Any,
+    trainer: Trainer,
+    scene: Scene,
+    figures: dict[str, Any],
+    interrupted: bool,
+    ctrl_c: CtrlC,
+) -> bool:
     """Write the model, measure it, and report; return whether Ctrl-C was pressed, in training or here.
 
-    Ctrl-C during the measurements ends them: the model is complete, and is reported without them. An
-    `interrupted` training is measured only on what it has learned from, and leaves a checkpoint.
+    The first Ctrl-C waits until the model is written, and then test views are not rendered; while they are,
+    it ends them. The model is complete, and is reported without them. An `interrupted` training is measured
+    only on what it has learned from, and leaves a checkpoint.
     """
     from vfr_bake.training.checkpoint import checkpoint_path
     from vfr_bake.training.model_file import save_model, trained_model
@@ -147,6 +153,8 @@ def _finish(options: Any, trainer: Trainer, scene: Scene, figures: dict[str, Any
     if witnesses is not None:
         figures["witness_psnr"] = {"patches": witnesses.patches, "whole": witnesses.whole}
     save_model(options.model, replace(model, figures=figures))
+    ctrl_c.waits = False
+    stopped = stopped or ctrl_c.pressed
     n_views, most_seconds = config.eval_views, math.inf
     if n_views is None:
         n_views = EVAL_VIEWS[scene.unbounded]
@@ -227,21 +235,30 @@ def _tell(data: str, text: str) -> None:
     _say(printable(f"{data}: {text}"))
 
 
-def _with_cameras(
-    data: str, say: Callable[[str], object] | None = None, scale: tuple[str, str, float] | None = None
-) -> str:
-    """Return the folder to load. Unpack a ZIP first, and estimate the cameras of photographs or a video that
-    have none, after looking for the pictures that `scale` names. What stays as it is keeps its name: `./demo`
-    is a folder, and `demo` the built-in scene. `say`: called with a sentence on what the estimation found."""
-    from vfr_bake.data import check_scale, needs_cameras, unpacked
+def _as_folder(data: str, say: Callable[[str], object]) -> str:
+    """Return the folder of the pictures of a ZIP or a video, which is unpacked first. What stays as it is
+    keeps its name: `./demo` is a folder, and `demo` the built-in scene. `say`: called with a sentence on what
+    cannot be read of a video."""
+    from vfr_bake.data import unpacked
+    from vfr_bake.data.files.video import extract_frames
+    from vfr_bake.data.poses import is_video
+
+    with Bars() as bars:
+        folder = unpacked(data, lambda done, of: bars.count("unpacking", done, of))
+        if is_video(folder):
+            folder = extract_frames(folder, lambda done, of: bars.count("frames", done, of), say)
+    return data if folder == Path(data) else str(folder)
+
+
+def _find_cameras(data: str, say: Callable[[str], object], scale: tuple[str, str, float] | None) -> None:
+    """Estimate the cameras of photographs that have none, after looking for the pictures that `scale` names.
+    `say`: called with a sentence on what the estimation found."""
+    from vfr_bake.data import check_scale, needs_cameras
     from vfr_bake.data.poses import added_since, estimate_cameras
 
     if data == "demo":
-        return data
-    with Bars() as bars:
-        folder = unpacked(data, lambda done, of: bars.count("unpacking", done, of))
-    if folder != Path(data):
-        data = str(folder)
+        return
+    folder = Path(data)
     if not needs_cameras(data):
         if added := added_since(folder):
             named = ", ".join(added[:3]) + (", ..." if len(added) > 3 else "")
@@ -250,15 +267,14 @@ def _with_cameras(
                 f"pictures that were added after the cameras were estimated are not used: {len(added)} "
                 f"({named}): remove {folder / 'sparse'} to use them",
             )
-        return data
-    if scale is not None and folder.is_dir():
+        return
+    if scale is not None:
         check_scale(folder, scale)
     with Bars() as bars:
-        report = estimate_cameras(Path(data), bars.count, say)
+        report = estimate_cameras(folder, bars.count, say)
     _say(printable(report.summary()))
     for name, reason in report.unplaced.items():
         _say(f"  no place for {printable(name)}: {printable(reason)}")
-    return data if report.folder == folder else str(report.folder)
 
 
 def _without_blurred(scene: Scene, processes: Processes) -> tuple[Scene, list[str]]:
@@ -299,7 +315,9 @@ def _preview(options: Any, scene: Scene) -> Preview:
     return Preview(scene, path)
 
 
-def _train_steps(trainer: Trainer, checkpoint: Path, preview: Preview | None) -> dict[str, Any]:
+def _train_steps(
+    trainer: Trainer, checkpoint: Path, preview: Preview | None, ctrl_c: CtrlC
+) -> dict[str, Any]:
     """Train to the end, or to the end of the step in which Ctrl-C is pressed, with a checkpoint now and then;
     return the figures to report. In the first step, and pressed twice, it raises KeyboardInterrupt."""
     from vfr_bake.training.length.expectation import EXPECTED_AT, TIMED_FROM, typical_step
@@ -308,7 +326,7 @@ def _train_steps(trainer: Trainer, checkpoint: Path, preview: Preview | None) ->
     interrupted = told = False
     ends: list[float] = []
     saved = time.monotonic()
-    with Bar("training", trainer.processes.first) as bar, CtrlC() as ctrl_c:
+    with Bar("training", trainer.processes.first) as bar:
         error, n_steps, rays = 0.0, 0, 0.0
         for last in trainer.run():
             ctrl_c.waits = True  # before the first step is done, there is nothing to keep

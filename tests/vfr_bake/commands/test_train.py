@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import pkgutil
 import shutil
 import signal
 from pathlib import Path
@@ -11,8 +12,9 @@ from typing import Any
 import pytest
 import torch
 
-from player.errors import OutputError
+from player.errors import DataError, OutputError
 from tests.vfr_bake.data.check.test_check import walk
+from tests.vfr_bake.data.files.test_video import write_video
 from vfr_bake.cli import train_main
 from vfr_bake.data.files.masks import stray_masks
 from vfr_bake.data.poses import PoseReport
@@ -78,6 +80,24 @@ def test_what_is_sure_to_end_a_training_is_told_before_any_work(
     assert train_main([str(tmp_path / "no data"), str(tmp_path / "model.pt"), *options]) == 1
     (told,) = capsys.readouterr().err.splitlines()
     assert message in told
+
+
+@pytest.mark.parametrize("suffix", ["zip", "avi"])
+def test_a_zip_and_a_video_are_looked_at_before_their_cameras_are_estimated(
+    suffix: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    if suffix == "zip":
+        data = shutil.make_archive(str(tmp_path / "photos"), "zip", walk(tmp_path / "walk", 6))
+    else:
+        data = str(write_video(tmp_path / "walk.avi", [8.0 * number for number in range(12)]))
+
+    def estimate(*_: Any) -> PoseReport:
+        raise DataError("found none")
+
+    monkeypatch.setattr("vfr_bake.data.poses.estimate_cameras", estimate)
+    assert train_main([data, str(tmp_path / "model.pt"), *SMALL]) == 1
+    told = capsys.readouterr().err.splitlines()
+    assert "pictures of" in told[0] and "hang together" in told[1] and told[-1].endswith("found none")
 
 
 def test_the_page_of_a_check_has_the_whole_name_of_the_folder(
@@ -224,6 +244,28 @@ def test_a_model_whose_measurement_is_interrupted_is_complete(
         assert load_model(model).figures["steps"] == 12
         assert "test_psnr" not in json.loads(report.read_text())
         assert not checkpoint_path(model).exists()
+
+
+@pytest.mark.parametrize("place", ["preview.Preview.write", "model_file.trained_model", "model_file.save_model"])
+def test_ctrl_c_after_the_last_step_waits_for_the_model(
+    place: str,
+    small_data: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    model = tmp_path / "model.pt"
+    whole = pkgutil.resolve_name(f"vfr_bake.training.{place}")
+
+    def pressed(*arguments: Any, **named: Any) -> Any:
+        signal.raise_signal(signal.SIGINT)
+        return whole(*arguments, **named)
+
+    monkeypatch.setattr(f"vfr_bake.training.{place}", pressed)
+    assert train_main([str(small_data), str(model), *SMALL, "--preview"]) == 130
+    assert "interrupted: the model is complete, but not measured" in capsys.readouterr().err
+    assert load_model(model).figures["steps"] == 12 and not checkpoint_path(model).exists()
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
 def test_a_checkpoint_that_cannot_be_written_ends_no_training(
