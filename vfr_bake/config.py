@@ -26,7 +26,7 @@ CHOICES = {
     "activation": get_args(Activation),
     "view_encoding": get_args(ViewEncoding),
 }
-UNBOUNDED_FIELD = {
+UNBOUNDED_FIELD: dict[str, Any] = {
     "unbounded": True,
     "max_resolution": 2048,
     "density_width": 0,
