@@ -3,7 +3,8 @@
 Sections are sorted by what they show: first all that the coarsest picture needs, then what makes it sharper,
 with densities before features and the first channels before the others. They are cut into parts so that the
 first picture, head and cameras included, needs only a few hundredths of the asset's bytes and appears at
-once. Further parts end at about a tenth, a quarter and half of the bytes (`SHARES`).
+once. Further parts end at about a tenth, a quarter and half of the bytes (`SHARES`). If head and cameras take
+so many of them that nothing can be shown within one of these shares, the first part ends at a later one.
 """
 
 from __future__ import annotations
