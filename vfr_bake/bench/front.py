@@ -56,17 +56,22 @@ def pareto_front(points: Sequence[Point]) -> list[bool]:
     return [point in front for point in points]
 
 
-def recommend(points: Sequence[Point], reference: float, against: str) -> str:
-    """Return one sentence that recommends settings for at most MAX_LOSS_DB, MAX_MS and MAX_MB.
+def recommend(points: Sequence[Point], reference: float, against: str) -> tuple[str, list[Point]]:
+    """Return one sentence that recommends settings for at most MAX_LOSS_DB, MAX_MS and MAX_MB, and the
+    settings that it names, each once.
 
     `points` are those of assets, `reference` is the PSNR that losses are counted from,
     and `against` is its name.
 
     >>> some = [Point("k 5", 30.0, 90.0, 1.0, 24.0), Point("k 2", 29.0, 50.0, 1.0, 18.0)]
-    >>> recommend(some, 30.05, "the model")
+    >>> sentence, named = recommend(some, 30.05, "the model")
+    >>> sentence
     'For at most 0.1 dB below the model play k 5 (0.05 dB, 90 ms, 24 MB); for at most 100 ms a frame play \
 k 5 (0.05 dB, 90 ms, 24 MB); for at most 20 MB play k 2 (1.05 dB, 50 ms, 18 MB).'
+    >>> [point.name for point in named]
+    ['k 5', 'k 2']
     """
+    named: list[Point] = []
 
     def told(point: Point) -> str:
         return f"{reference - point.psnr:.2f} dB, {point.ms:.0f} ms, {point.megabytes:.0f} MB"
@@ -76,10 +81,13 @@ k 5 (0.05 dB, 90 ms, 24 MB); for at most 20 MB play k 2 (1.05 dB, 50 ms, 18 MB).
         else the one of the best quality."""
         fitting = [point for point in points if cost(point) <= limit]
         if not fitting:
-            nearest = min(points, key=cost)
-            return f"for {wanted} there is none, nearest is {nearest.name} ({told(nearest)})"
-        chosen = min(fitting, key=lambda p: (p.ms, -p.psnr) if fast else (-p.psnr, p.ms))
-        return f"for {wanted} play {chosen.name} ({told(chosen)})"
+            chosen, verb = min(points, key=cost), "there is none, nearest is"
+        else:
+            chosen = min(fitting, key=lambda p: (p.ms, -p.psnr) if fast else (-p.psnr, p.ms))
+            verb = "play"
+        if chosen not in named:
+            named.append(chosen)
+        return f"for {wanted} {verb} {chosen.name} ({told(chosen)})"
 
     below = f"at most {MAX_LOSS_DB:g} dB below {against}"
     parts = (
@@ -88,4 +96,4 @@ k 5 (0.05 dB, 90 ms, 24 MB); for at most 20 MB play k 2 (1.05 dB, 50 ms, 18 MB).
         best_for(f"at most {MAX_MB:g} MB", MAX_MB, lambda point: point.megabytes),
     )
     sentence = "; ".join(parts)
-    return f"{sentence[0].upper()}{sentence[1:]}."
+    return f"{sentence[0].upper()}{sentence[1:]}.", named

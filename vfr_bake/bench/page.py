@@ -27,6 +27,7 @@ def trade_page(trade: Trade) -> bytes:
     return page(
         "Speed and accuracy",
         f"<p>{escape(trade.recommendation)}</p>",
+        *map(_commands, trade.recommended),
         f"<p>{len(trade.conditions['views'])} test views of {escape(str(trade.conditions['data']))}, "
         f"{width}x{height}; {trade.conditions['frames_a_setting_and_size']} frames a setting and size, in "
         f"turns; {trade.conditions['threads']} threads, {escape(trade.conditions['march'])}. {fitted}"
@@ -42,10 +43,7 @@ def trade_page(trade: Trade) -> bytes:
         _settings_table(trade),
         *(_times_table(trade, size) for size in trade.sizes),
         "<h2>Commands of the front</h2>",
-        *(
-            f"<p>{escape(setting.name)}</p><pre>{escape(chr(10).join(filter(None, setting.commands)))}</pre>"
-            for setting in front
-        ),
+        *map(_commands, front),
         f"<h2>Where the loss sits</h2><p>Each asset's worst view with its own k: {wanted}, played, "
         f"difference (white: {BRIGHTEST_ERROR:g} of the range or more). Below, the pixels that are farthest "
         "off in all views, and their rays.</p>",
@@ -53,8 +51,13 @@ def trade_page(trade: Trade) -> bytes:
     )
 
 
-def table_lines(trade: Trade) -> list[str]:
-    """Return the settings on the front as lines of plain text, best first."""
+def _commands(setting: Setting) -> str:
+    return f"<p>{escape(setting.name)}</p><pre>{escape(chr(10).join(filter(None, setting.commands)))}</pre>"
+
+
+def trade_lines(trade: Trade) -> list[str]:
+    """Return the settings on the front as lines of plain text, best first, then the recommendation and the
+    commands of the settings that it names."""
     titles = ["setting", "PSNR", "loss", "SSIM", "ms", "p95", "MB"]
     front = [setting for setting in trade.settings if setting.on_front]
     front.sort(key=lambda setting: -setting.point.psnr)
@@ -66,6 +69,9 @@ def table_lines(trade: Trade) -> list[str]:
         numbers = (cell.rjust(width) for cell, width in zip(cells[1:], widths[1:], strict=True))
         lines.append("  ".join([cells[0].ljust(widths[0]), *numbers]))
         lines += [f"    {command}" for command in some if command]
+    lines.append(trade.recommendation)
+    for setting in trade.recommended:
+        lines += [setting.name, *(f"    {command}" for command in setting.commands if command)]
     return lines
 
 

@@ -59,6 +59,8 @@ class Trade:
 
     settings: list[Setting]
     recommendation: str
+    recommended: list[Setting]
+    """The settings that the recommendation names."""
     sizes: list[Size]
     """Sizes of the frames. The first is that of the first photograph, for which the front is found."""
     conditions: dict[str, Any]
@@ -72,15 +74,18 @@ class Trade:
         """Return the content of the JSON file."""
         return {
             "recommendation": self.recommendation,
+            "recommended": [
+                {"name": setting.name, "commands": setting.commands} for setting in self.recommended
+            ],
             "conditions": self.conditions,
             "settings": [_plain(setting) for setting in self.settings],
             "worst_pixels": {name: [asdict(pixel) for pixel in some] for name, some in self.worst.items()},
         }
 
 
-def conclude(settings: list[Setting], model: Setting | None) -> tuple[list[Setting], str]:
-    """Return all settings, the model's first, with their losses and places on the front, and the
-    sentence that recommends some."""
+def conclude(settings: list[Setting], model: Setting | None) -> tuple[list[Setting], str, list[Setting]]:
+    """Return all settings, the model's first, with their losses and places on the front, the sentence that
+    recommends some, and these."""
     best = max(setting.point.psnr for setting in settings)
     reference = best if model is None else model.point.psnr
     every = settings if model is None else [model, *settings]
@@ -89,10 +94,9 @@ def conclude(settings: list[Setting], model: Setting | None) -> tuple[list[Setti
         replace(setting, on_front=on, scores=setting.scores | {"loss_db": reference - setting.point.psnr})
         for setting, on in zip(every, front, strict=True)
     ]
-    sentence = recommend(
-        [setting.point for setting in settings], reference, "the full model" if model else "the best setting"
-    )
-    return told, sentence
+    points = [setting.point for setting in settings]
+    sentence, named = recommend(points, reference, "the full model" if model else "the best setting")
+    return told, sentence, [settings[points.index(point)] for point in named]
 
 
 def _plain(setting: Setting) -> dict[str, Any]:

@@ -146,7 +146,7 @@ def measure_trade(config: BenchConfig, lpips: Distance | None, progress: Report)
         for index, (name, asset) in enumerate(assets.items())
         for some in dials
     ]
-    settings, sentence = conclude(rows, model)
+    settings, sentence, recommended = conclude(rows, model)
     conditions = {
         "data": config.data,
         "model": None if config.model is None else str(config.model),
@@ -162,7 +162,7 @@ def measure_trade(config: BenchConfig, lpips: Distance | None, progress: Report)
     }
     pictures = [quality.worst_view for quality in qualities]
     worst = {quality.worst_view.name: quality.worst for quality in qualities}
-    return Trade(settings, sentence, sizes, conditions, pictures, worst)
+    return Trade(settings, sentence, recommended, sizes, conditions, pictures, worst)
 
 
 @dataclass(frozen=True, eq=False)

@@ -72,7 +72,7 @@ def eval_command(options: Any) -> int:
 
 def bench_command(options: Any) -> int:
     """Measure assets as `options` says (`vfr_bake.options.Bench`); return the exit code."""
-    from vfr_bake.bench.page import table_lines, trade_page
+    from vfr_bake.bench.page import trade_lines, trade_page
     from vfr_bake.bench.trade import measure_trade
     from vfr_bake.training.scores.lpips import Lpips
 
@@ -93,7 +93,7 @@ def bench_command(options: Any) -> int:
         )
     if options.html is not None:
         write_bytes(options.html, trade_page(trade))
-    write_result(options.json, trade.document(), "\n".join([*table_lines(trade), trade.recommendation]))
+    write_result(options.json, trade.document(), "\n".join(trade_lines(trade)))
     return 0
 
 

@@ -152,7 +152,7 @@ def test_the_page_shows_plots_and_pictures(results: tuple[dict, str], shells_fol
     assert page.count("<svg") == 3 and page.count('src="data:image/png;base64,') == 1
     assert "http" not in page and document["recommendation"] in page.replace("&#x27;", "'")
     on_front = [row for row in document["settings"] if row["on_front"]]
-    assert on_front and all(row["commands"][1] in page for row in on_front)
+    assert on_front and all(row["commands"][1] in page for row in [*on_front, *document["recommended"]])
     worst = document["worst_pixels"][str(shells_folder)]
     assert [pixel["error"] for pixel in worst] == sorted([p["error"] for p in worst], reverse=True)
 
@@ -168,20 +168,22 @@ def test_against_the_full_model(
     monkeypatch.setattr("vfr_bake.bench.trade.N_FIRST_PICTURES", 1)
     arguments = [str(shells_folder), "--data", str(data), "--model", str(model), "--samples", "5", *QUICK]
     assert bench_main([*arguments, "--json", str(tmp_path / "t.json")]) == 0
-    first, *rows = json.loads((tmp_path / "t.json").read_text())["settings"]
+    document = json.loads((tmp_path / "t.json").read_text())
+    first, *rows = document["settings"]
     assert first["name"] == str(model) and first["scores"]["loss_db"] == 0
     assert first["n_bytes"] == model.stat().st_size and first["commands"] == [f"vfr-eval {model} {data}"]
     assert first["times"]["48x40"]["median"] > 0
     for row in rows:
         assert row["scores"]["psnr_to_model"] < 40
         assert row["scores"]["loss_db"] == pytest.approx(first["scores"]["psnr"] - row["scores"]["psnr"])
-    title, *lines, sentence = capsys.readouterr().out.splitlines()
+    title, *lines = capsys.readouterr().out.splitlines()
+    end = lines.index(document["recommendation"])
     assert title.split() == ["setting", "PSNR", "loss", "SSIM", "ms", "p95", "MB"]
-    assert sum(row["on_front"] for row in (first, *rows)) == len(lines) // 2
+    assert sum(row["on_front"] for row in (first, *rows)) == end // 2
     assert re.search(r"k=5 +[\d.]+ +-[\d.]+ +[\d.]+ +\d+ ±\d+ +\d+ +[\d.]+$", lines[0])
-    assert lines[1].strip().startswith("vfr-play ") and sentence.startswith(
-        "For at most 0.1 dB below the full"
-    )
+    assert lines[1].strip().startswith("vfr-play ") and lines[end].startswith("For at most 0.1 dB below the")
+    named = [line for one in document["recommended"] for line in (one["name"], "    " + one["commands"][1])]
+    assert named and lines[end + 1 :] == named and all(name in lines[end] for name in named[::2])
 
 
 @pytest.mark.parametrize(
@@ -317,8 +319,8 @@ def test_noise_throws_nothing_out() -> None:
 
 
 def test_what_nothing_reaches_is_said() -> None:
-    sentence = recommend([Point("only", 28, 500, 1, 40)], 31, "the model")
-    assert sentence.count("there is none, nearest is only (3.00 dB, 500 ms, 40 MB)") == 3
+    sentence, named = recommend([only := Point("only", 28, 500, 1, 40)], 31, "the model")
+    assert named == [only] and sentence.count("there is none, nearest is only (3.00 dB, 500 ms, 40 MB)") == 3
 
 
 # --- times ---
