@@ -92,11 +92,12 @@ def train_command(options: Any) -> int:
         if processes.first:
             _say(f"going on after step {trainer.next_step}")
     preview = _preview(options, scene) if options.preview and processes.first else None
-    figures = _train_steps(trainer, checkpoint, preview)
-    figures["blurred"] = blurred
-    stopped = figures.pop("interrupted")
-    if processes.first:
-        stopped = _finish(options, trainer, scene, figures, stopped)
+    with CtrlC() as ctrl_c:
+        figures = _train_steps(trainer, checkpoint, preview, ctrl_c)
+        figures["blurred"] = blurred
+        stopped = figures.pop("interrupted")
+        if processes.first:
+            stopped = _finish(options, trainer, scene, figures, stopped, ctrl_c)
     processes.leave()
     return 130 if stopped else 0
 
@@ -123,11 +124,19 @@ def _given(settings: Any) -> Iterator[str]:
             yield field.name
 
 
-def _finish(options: Any, trainer: Trainer, scene: Scene, figures: dict[str, Any], interrupted: bool) -> bool:
+def _finish(
+    options: Any,
+    trainer: Trainer,
+    scene: Scene,
+    figures: dict[str, Any],
+    interrupted: bool,
+    ctrl_c: CtrlC,
+) -> bool:
     """Write the model, measure it, and report; return whether Ctrl-C was pressed, in training or here.
 
-    Ctrl-C during the measurements ends them: the model is complete, and is reported without them. An
-    `interrupted` training is measured only on what it has learned from, and leaves a checkpoint.
+    The first Ctrl-C waits until the model is written, and then test views are not rendered; while they are,
+    it ends them. The model is complete, and is reported without them. An `interrupted` training is measured
+    only on what it has learned from, and leaves a checkpoint.
     """
     from vfr_bake.training.checkpoint import checkpoint_path
     from vfr_bake.training.model_file import save_model, trained_model
@@ -144,6 +153,8 @@ def _finish(options: Any, trainer: Trainer, scene: Scene, figures: dict[str, Any
     if witnesses is not None:
         figures["witness_psnr"] = {"patches": witnesses.patches, "whole": witnesses.whole}
     save_model(options.model, replace(model, figures=figures))
+    ctrl_c.waits = False
+    stopped = stopped or ctrl_c.pressed
     n_views, most_seconds = config.eval_views, math.inf
     if n_views is None:
         n_views = EVAL_VIEWS[scene.unbounded]
@@ -304,7 +315,9 @@ def _preview(options: Any, scene: Scene) -> Preview:
     return Preview(scene, path)
 
 
-def _train_steps(trainer: Trainer, checkpoint: Path, preview: Preview | None) -> dict[str, Any]:
+def _train_steps(
+    trainer: Trainer, checkpoint: Path, preview: Preview | None, ctrl_c: CtrlC
+) -> dict[str, Any]:
     """Train to the end, or to the end of the step in which Ctrl-C is pressed, with a checkpoint now and then;
     return the figures to report. In the first step, and pressed twice, it raises KeyboardInterrupt."""
     from vfr_bake.training.length.expectation import EXPECTED_AT, TIMED_FROM, typical_step
@@ -313,7 +326,7 @@ def _train_steps(trainer: Trainer, checkpoint: Path, preview: Preview | None) ->
     interrupted = told = False
     ends: list[float] = []
     saved = time.monotonic()
-    with Bar("training", trainer.processes.first) as bar, CtrlC() as ctrl_c:
+    with Bar("training", trainer.processes.first) as bar:
         error, n_steps, rays = 0.0, 0, 0.0
         for last in trainer.run():
             ctrl_c.waits = True  # before the first step is done, there is nothing to keep

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import pkgutil
 import shutil
 import signal
 from pathlib import Path
@@ -243,6 +244,30 @@ def test_a_model_whose_measurement_is_interrupted_is_complete(
         assert load_model(model).figures["steps"] == 12
         assert "test_psnr" not in json.loads(report.read_text())
         assert not checkpoint_path(model).exists()
+
+
+@pytest.mark.parametrize(
+    "place", ["preview.Preview.write", "model_file.trained_model", "model_file.save_model"]
+)
+def test_ctrl_c_after_the_last_step_waits_for_the_model(
+    place: str,
+    small_data: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    model = tmp_path / "model.pt"
+    whole = pkgutil.resolve_name(f"vfr_bake.training.{place}")
+
+    def pressed(*arguments: Any, **named: Any) -> Any:
+        signal.raise_signal(signal.SIGINT)
+        return whole(*arguments, **named)
+
+    monkeypatch.setattr(f"vfr_bake.training.{place}", pressed)
+    assert train_main([str(small_data), str(model), *SMALL, "--preview"]) == 130
+    assert "interrupted: the model is complete, but not measured" in capsys.readouterr().err
+    assert load_model(model).figures["steps"] == 12 and not checkpoint_path(model).exists()
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
 def test_a_checkpoint_that_cannot_be_written_ends_no_training(
