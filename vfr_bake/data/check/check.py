@@ -148,15 +148,20 @@ def check_data(
     shared = compare(seen, 0.2 * seconds)
     blurry = _blurred(seen)
     partners = _partners(len(seen), shared)
-    checked = []
+    checked: list[CheckedPicture] = []
+    wrong_masks: list[str] = []
     for number, (name, look) in enumerate(zip(pictures.names, looks, strict=True)):
         why = look if isinstance(look, str) else _fault(seen[number], number in blurry, partners[number])
         if pictures.found[number] is False and why is None:
             why = pictures.why.get(name, "the estimation of cameras found no place for it")
-        if isinstance(look, str):
+        if isinstance(look, PictureMeasures):
+            full = look.size
+        elif isinstance(look, str) and not look.startswith(f"{pictures.masks[number]}: "):
             full = None  # the pixels cannot be read, although the header may be whole
         else:
-            full = look.size if look else _size(pictures.paths[number])
+            full = _size(pictures.paths[number])
+            if isinstance(look, str) and pictures.found[number] is not False:
+                wrong_masks.append(look)
         checked.append(
             CheckedPicture(
                 name,
@@ -170,7 +175,7 @@ def check_data(
         )
     figures = _figures(checked, shared)
     unreadable = [picture.name for picture in checked if picture.size is None and picture.found is not False]
-    verdict, likely, advice = judged(figures, pictures.cameras, unreadable)
+    verdict, likely, advice = judged(figures, pictures.cameras, unreadable, wrong_masks)
     return Check(
         *(data, pictures.kind, checked, pictures.cameras, figures, verdict, likely, advice),
         time.monotonic() - begin,

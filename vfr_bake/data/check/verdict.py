@@ -30,10 +30,10 @@ GOOD, DOUBTFUL, BAD = "good", "doubtful", "bad"
 
 
 def judged(
-    figures: dict[str, Any], cameras: Sequence[Camera], unreadable: Sequence[str]
+    figures: dict[str, Any], cameras: Sequence[Camera], unreadable: Sequence[str], wrong_masks: Sequence[str]
 ) -> tuple[str, list[str], list[str]]:
     """Return the verdict, what is likely to come out, and what to photograph. `unreadable`: the names of
-    pictures that would make training stop."""
+    pictures that would make training stop. `wrong_masks`: what is wrong with masks that would."""
     n, seen = figures["n_pictures"], max(figures["n_looked_at"], 1)
     likely, advice, bad, doubts = [], [], False, False
     turned = figures["share_turned_on_the_spot"] or 0.0
@@ -66,6 +66,10 @@ def judged(
             f"copy {', '.join(unreadable[:NAMED])}{others} again, or leave them out: what cannot be read to "
             "its end ends the training."
         )
+    if wrong_masks:
+        bad = True
+        others = f"; masks that are wrong, in all: {len(wrong_masks)}" if len(wrong_masks) > 1 else ""
+        advice.append(f"{wrong_masks[0]}{others}.")
     if turned > TURNED:
         doubts = True
         bad |= all_turned

@@ -157,6 +157,19 @@ def test_pictures_that_are_cut_short_are_bad_and_named(tmp_path: Path) -> None:
     assert any("copy p03.jpg, p05.jpg, p09.jpg and 2 others again" in line for line in check.advice)
 
 
+def test_a_mask_of_another_size_is_named(tmp_path: Path) -> None:
+    """The picture itself is whole, so that another copy of it would change nothing."""
+    folder = walk(tmp_path / "walk", 24)
+    (folder / "masks").mkdir()
+    for name in ("p03.png", "p04.png"):
+        Image.new("L", (48, 40), 255).save(folder / "masks" / name)
+    check = checked(folder)
+    assert check.verdict == BAD and check.figures["n_unreadable"] == 0
+    (told,) = (line for line in check.advice if "p03" in line)
+    assert "p03.png: mask: expected 480x400 pixels as p03.jpg has, got 48x40: save it in the size" in told
+    assert told.endswith("or remove it; masks that are wrong, in all: 2.")
+
+
 def test_a_picture_without_a_camera_is_not_read_by_training(tmp_path: Path) -> None:
     folder = write_model(tmp_path / "toy", demo_cameras(24, 10))
     walk(folder / "images", 1)
