@@ -207,8 +207,9 @@ def estimate_cameras(
     if n_registered < _n_needed(len(names)):
         raise DataError(
             f"{photos}: cameras: expected to find those of at least {_n_needed(len(names))} of "
-            f"{len(names)} pictures, got {n_registered}: {_places(names, pairs)}"
-            f"{_advice(photos, masks, len(pictures))}"
+            f"{len(names)} pictures, got {n_registered}: "
+            + (f"{apart}: " if (apart := places(names, [(pair.i, pair.j) for pair in pairs])) else "")
+            + _advice(photos, masks, len(pictures))
         )
     _turn_upright(models[0])
     placed = _names_in(models[0])
@@ -364,10 +365,10 @@ def connected(numbers: Iterable[int], pairs: Iterable[tuple[int, int]]) -> list[
     return list({id(group): group for group in groups.values()}.values())
 
 
-def _places(names: Sequence[str], pairs: Sequence[Pair]) -> str:
+def places(names: Sequence[str], pairs: Iterable[tuple[int, int]]) -> str:
     """Return a clause on the groups that the pictures fall into if the groups have nothing in common; empty
-    for one group."""
-    groups = connected(range(len(names)), [(pair.i, pair.j) for pair in pairs])
+    for one group. `pairs`: the numbers of pictures that have something in common."""
+    groups = connected(range(len(names)), pairs)
     large = [group for group in groups if len(group) >= MIN_PICTURES]
     large.sort(key=lambda group: (-len(group), min(group)))
     if len(large) < 2:
@@ -375,7 +376,7 @@ def _places(names: Sequence[str], pairs: Sequence[Pair]) -> str:
     named = " and ".join(f"{len(group)} ({names[min(group)]} to {names[max(group)]})" for group in large[:3])
     return (
         f"they show {len(large)} places that have nothing in common, in {named} pictures: name a folder of "
-        "one place, or add pictures that lead from one to the other: "
+        "one place, or add pictures that lead from one to the other"
     )
 
 

@@ -17,7 +17,14 @@ from player.cameras.colmap import colmap_folder
 from player.errors import ConfigError, DataError
 from player.progress import Progress
 from vfr_bake.data.capture import PosedImages
-from vfr_bake.data.check.looks import MIN_SHARED, PictureMeasures, Shared, compare, look_at
+from vfr_bake.data.check.looks import (
+    MIN_SHARED,
+    PictureMeasures,
+    Shared,
+    compare,
+    look_at,
+    repeated_ones,
+)
 from vfr_bake.data.check.turning import share_turned
 from vfr_bake.data.check.verdict import GOOD_SHARED, judged
 from vfr_bake.data.files.archives import is_archive, unpack
@@ -27,7 +34,7 @@ from vfr_bake.data.files.masks import mask_of
 from vfr_bake.data.files.pictures import DescribedView, picture_size
 from vfr_bake.data.files.video import extract_frames
 from vfr_bake.data.folders import has_transforms, load_folder
-from vfr_bake.data.poses import added_since, connected, is_video
+from vfr_bake.data.poses import added_since, connected, is_video, places
 from vfr_bake.data.quality.sharpness import blurred
 from vfr_bake.data.store.reading import PictureReader
 from vfr_bake.data.store.working import WorkingSize
@@ -146,6 +153,7 @@ def check_data(
     looks = look_at(list(zip(pictures.paths, pictures.masks, strict=True)), 0.8 * seconds, progress, most)
     seen = [look if isinstance(look, PictureMeasures) else None for look in looks]
     shared = compare(seen, 0.2 * seconds)
+    repeated = repeated_ones(seen)
     blurry = _blurred(seen)
     partners = _partners(len(seen), shared)
     checked: list[CheckedPicture] = []
@@ -173,9 +181,11 @@ def check_data(
                 why,
             )
         )
-    figures = _figures(checked, shared)
+    figures = _figures(checked, shared, repeated)
     unreadable = [picture.name for picture in checked if picture.size is None and picture.found is not False]
-    verdict, likely, advice = judged(figures, pictures.cameras, unreadable, wrong_masks)
+    verdict, likely, advice = judged(
+        figures, pictures.cameras, unreadable, wrong_masks, _places(pictures.names, shared)
+    )
     return Check(
         *(data, pictures.kind, checked, pictures.cameras, figures, verdict, likely, advice),
         time.monotonic() - begin,
@@ -253,17 +263,20 @@ def _fault(look: PictureMeasures | None, blurry: bool, partners: int | None) -> 
     return "nothing in common with the pictures around it" if partners == 0 else None
 
 
-def _figures(pictures: Sequence[CheckedPicture], shared: dict[tuple[int, int], Shared]) -> dict[str, Any]:
+def _figures(
+    pictures: Sequence[CheckedPicture], shared: dict[tuple[int, int], Shared], repeated: set[int]
+) -> dict[str, Any]:
     looks = [picture.look for picture in pictures if picture.look is not None]
     next_ones = [both.n_features for (i, j), both in shared.items() if j == i + 1]
     changes = [abs(both.change) for both in shared.values() if both.n_features >= GOOD_SHARED]
-    group = _largest_group(shared)
+    group = _largest_group(shared, repeated)
     turned = share_turned([both.points for both in shared.values() if both.points is not None])
     faults = Counter(picture.why for picture in pictures if picture.why)
     return {
         "n_pictures": len(pictures),
         "n_looked_at": len(looks),
         "n_found": sum(picture.found is True for picture in pictures),
+        "n_repeated": len(repeated),
         "n_unreadable": sum(picture.size is None for picture in pictures),
         "sizes": _counted(picture.size for picture in pictures),
         "sizes_used": _counted(picture.used for picture in pictures),
@@ -277,12 +290,23 @@ def _figures(pictures: Sequence[CheckedPicture], shared: dict[tuple[int, int], S
     }
 
 
-def _largest_group(shared: dict[tuple[int, int], Shared]) -> float:
+def _connections(shared: dict[tuple[int, int], Shared]) -> list[tuple[int, int]]:
+    return [pair for pair, both in shared.items() if both.n_features >= MIN_SHARED]
+
+
+def _largest_group(shared: dict[tuple[int, int], Shared], repeated: set[int]) -> float:
     """Return the share of the compared pictures that are in the largest group that is connected by shared
-    features."""
+    features. Those that are `repeated` do not count."""
     numbers = {number for pair in shared for number in pair}
-    groups = connected(numbers, [pair for pair, both in shared.items() if both.n_features >= MIN_SHARED])
-    return max(map(len, groups)) / len(numbers) if numbers else 0.0
+    groups = connected(numbers, _connections(shared))
+    n_counted = len(numbers - repeated)
+    return max(len(group - repeated) for group in groups) / n_counted if n_counted else 0.0
+
+
+def _places(names: Sequence[str], shared: dict[tuple[int, int], Shared]) -> str:
+    """Return a clause on the groups that the pictures fall into if they have nothing in common; empty for one
+    group, or unless each picture was compared with each other."""
+    return places(names, _connections(shared)) if len(shared) == math.comb(len(names), 2) else ""
 
 
 def _summary(figures: dict[str, Any]) -> list[str]:

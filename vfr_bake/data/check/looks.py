@@ -29,6 +29,8 @@ from vfr_bake.data.files.pictures import (
     sharpness,
     shrunk,
 )
+from vfr_bake.data.files.repeats import repeats
+from vfr_bake.data.kept_matches import SIDE
 from vfr_bake.data.quality.sharpness import blur
 from vfr_bake.data.threads import n_threads, one_by_one
 
@@ -164,6 +166,25 @@ def look_at(
         if progress is not None:
             progress(done + 1, len(order))
     return seen
+
+
+def repeated_ones(looks: Sequence[PictureMeasures | None]) -> set[int]:
+    """Return the numbers of the pictures that show what another one shows (`vfr_bake.data.files.repeats`)."""
+    there = [(i, seen) for i, seen in enumerate(looks) if seen is not None]
+    if not there:
+        return set()
+    thumbnails = []
+    for _, seen in there:
+        with Image.open(io.BytesIO(seen.thumbnail)) as picture:
+            small = picture.convert("L").resize((SIDE, SIDE), Image.Resampling.BOX)
+        thumbnails.append(np.asarray(small, np.float32).reshape(-1))
+    found = repeats(
+        [seen for _, seen in there],
+        [(seen.size[0] / max(seen.size), seen.size[1] / max(seen.size)) for _, seen in there],
+        np.stack(thumbnails),
+        [seen.sharpness for _, seen in there],
+    )
+    return {there[n][0] for n in found}
 
 
 def compare(looks: Sequence[PictureMeasures | None], seconds: float) -> dict[tuple[int, int], Shared]:

@@ -30,10 +30,15 @@ GOOD, DOUBTFUL, BAD = "good", "doubtful", "bad"
 
 
 def judged(
-    figures: dict[str, Any], cameras: Sequence[Camera], unreadable: Sequence[str], wrong_masks: Sequence[str]
+    figures: dict[str, Any],
+    cameras: Sequence[Camera],
+    unreadable: Sequence[str],
+    wrong_masks: Sequence[str],
+    places: str,
 ) -> tuple[str, list[str], list[str]]:
     """Return the verdict, what is likely to come out, and what to photograph. `unreadable`: the names of
-    pictures that would make training stop. `wrong_masks`: what is wrong with masks that would."""
+    pictures that would make training stop. `wrong_masks`: what is wrong with masks that would.
+    `places`: a clause on groups of pictures that have nothing in common; empty for one group."""
     n, seen = figures["n_pictures"], max(figures["n_looked_at"], 1)
     likely, advice, bad, doubts = [], [], False, False
     turned = figures["share_turned_on_the_spot"] or 0.0
@@ -42,14 +47,25 @@ def judged(
         likely.append(f"the cameras of {figures['n_found']} pictures are known.")
         bad = figures["n_found"] < 2
     else:
-        share = figures["share_in_one_group"]
-        bad = n < MIN_PICTURES or share < MIN_SHARE / 2
+        share, n_repeated = figures["share_in_one_group"], figures["n_repeated"]
+        n_different = round(n * (1 - n_repeated / seen))
+        alike = n_different < MIN_PICTURES
+        apart = share < MIN_SHARE and places
+        bad = alike or share < MIN_SHARE / 2 or bool(apart)
         doubts |= share < 0.9
         placed = (
-            "are from one place, which tells no depth" if all_turned else "are likely to find their cameras"
-        )
-        likely.append(f"about {min(n, round(share * n))} of {n} pictures hang together and {placed}.")
-        if share < 0.9:
+            "are from one place, which tells no depth" if all_turned or (alike and n_repeated)
+            else "are likely to find their cameras"
+        )  # fmt: skip
+        about = round(share * n_different)
+        likely.append(f"about {about} of {n_different} pictures hang together and {placed}.")
+        if n_repeated:
+            likely.append(f"{n - n_different} more show what another one does.")
+        if alike and n_repeated:
+            advice.append("move around the subject, and photograph it from different places.")
+        elif apart:
+            advice.append(f"{apart}.")
+        elif share < 0.9:
             advice.append(
                 "photograph with steps of some 10 degrees, so that each picture shows most of what the one "
                 "before it does, and add pictures between those that share nothing."

@@ -8,10 +8,11 @@ moves a subject by several hundredths of the picture.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Protocol
 
 import numpy as np
 
-from vfr_bake.data.features import Features, match
+from vfr_bake.data.features import match
 
 MAX_SHIFT = 0.005
 """Distance by which features may move, as a share of the longer side: 8 of 1600 pixels, as with a hand that
@@ -29,9 +30,23 @@ SAME = 1.5
 camera on a tripod stays below it."""
 
 
+class HasFeatures(Protocol):
+    """The features of a picture, for example `vfr_bake.data.features.Features`."""
+
+    @property
+    def points(self) -> np.ndarray:
+        """[n, 2], in the unit of the picture's size."""
+        ...
+
+    @property
+    def descriptors(self) -> np.ndarray:
+        """[n, 128], of unit length."""
+        ...
+
+
 def repeats(
-    features: Sequence[Features],
-    sizes: Sequence[tuple[int, int]],
+    features: Sequence[HasFeatures],
+    sizes: Sequence[tuple[float, float]],
     thumbnails: np.ndarray,
     sharpness: Sequence[float],
 ) -> dict[int, int]:
@@ -44,6 +59,7 @@ def repeats(
     `features`: of each picture, in order. `sizes`: (width, height). `thumbnails`: [n, n_pixels] grey levels.
     `sharpness`: larger for sharper.
 
+    >>> from vfr_bake.data.features import Features
     >>> nothing = Features(np.zeros((0, 2)), np.zeros((0, 128), np.float32))
     >>> repeats([nothing, nothing], [(8, 6), (8, 6)], np.zeros((2, 4)), [1.0, 2.0])
     {}
@@ -69,7 +85,9 @@ def repeats(
     return dict(sorted(repeated.items()))
 
 
-def show_same(a: Features, b: Features, size_a: tuple[int, int], size_b: tuple[int, int]) -> bool:
+def show_same(
+    a: HasFeatures, b: HasFeatures, size_a: tuple[float, float], size_b: tuple[float, float]
+) -> bool:
     """Return whether two pictures of one shape, of sizes (width, height), show the same from the same place.
     One may be a copy of the other that was made smaller."""
     (width_a, height_a), (width_b, height_b) = size_a, size_b

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 import sys
 from dataclasses import replace
 from pathlib import Path, PurePath
@@ -75,8 +76,24 @@ def test_pictures_of_two_places_fall_apart(tmp_path: Path) -> None:
     folder = walk(tmp_path / "walk", 8, 0, prefix="a")
     walk(folder, 8, 1, prefix="b")
     check = checked(folder)
-    assert check.figures["share_in_one_group"] == 0.5 and check.verdict != "good"
+    assert check.figures["share_in_one_group"] == 0.5 and check.verdict == BAD
     assert any("about 8 of 16" in line for line in check.likely)
+    groups = "they show 2 places that have nothing in common, in 8 (a00.jpg to a07.jpg) and 8 (b00.jpg to b07"
+    assert sum(line.startswith(groups) for line in check.advice) == 1
+    walk(folder, 16, 0, prefix="a")
+    check = checked(folder)
+    assert check.verdict == "doubtful", "a training would take the larger place, with two in three pictures"
+
+
+@pytest.mark.parametrize(("n_places", "verdict"), [(1, BAD), (2, BAD), (3, "doubtful")])
+def test_pictures_that_show_the_same_count_once(n_places: int, verdict: str, tmp_path: Path) -> None:
+    folder = walk(tmp_path / "walk", n_places)
+    for number in range(n_places, 10):
+        shutil.copy(folder / f"p{number % n_places:02d}.jpg", folder / f"p{number:02d}.jpg")
+    check = checked(folder)
+    assert check.figures["n_repeated"] == 10 - n_places and check.verdict == verdict
+    assert f"about {n_places} of {n_places} pictures hang together" in check.likely[0]
+    assert any("move around the subject" in line for line in check.advice) == (verdict == BAD)
 
 
 def test_all_blurred_and_plain(tmp_path: Path) -> None:
