@@ -21,7 +21,7 @@ from vfr_bake.data.files.video import frames_folder
 from vfr_bake.data.folders import has_transforms, load_folder
 from vfr_bake.data.poses import is_video
 from vfr_bake.data.scene import PosedImages, Scene, build_scene
-from vfr_bake.data.store.reading import PictureReader
+from vfr_bake.data.store.reading import DescribingReader, PictureReader
 from vfr_bake.data.store.working import MAX_SIDE, WorkingSize
 from vfr_bake.data.world import named, scaled
 
@@ -72,9 +72,11 @@ def load_scene(
         if is_video(folder):
             check_source(frames_folder(folder), folder)
             folder = frames_folder(folder)
-        capture = load_folder(folder, progress, reader)
         if (model := colmap_folder(folder)) is not None:
             why = read_record(model).why_without_camera()
+        if scale is not None:  # what is mistyped is found out before the pictures are read
+            scaled(load_folder(folder, None, DescribingReader()), *scale, why)
+        capture = load_folder(folder, progress, reader)
     if scale is not None:
         capture = scaled(capture, *scale, why)
     return build_scene(capture, kind, reader.say)

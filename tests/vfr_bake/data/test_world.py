@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from player.errors import DataError
-from vfr_bake.data import check_scale
+from vfr_bake.data import check_scale, load_scene
 from vfr_bake.data.capture import Capture, PosedImages
 from vfr_bake.data.demo import demo_views
+from vfr_bake.data.store.reading import PictureReader
 from vfr_bake.data.world import find_up, scaled, turn_to_z
 
 
@@ -118,3 +119,11 @@ def test_names_that_are_mistyped_are_found_before_cameras_are_estimated(tmp_path
         DataError, match=r"3.jpg: expected one picture of that name, got none: the first is called a/1"
     ):
         check_scale(tmp_path, ("a/1.jpg", "3.jpg", 1.0))
+
+
+def test_names_that_are_mistyped_are_found_before_pictures_are_read(
+    small_data: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delattr(PictureReader, "read")
+    with pytest.raises(DataError, match="scale: IMG_9: expected one picture with a camera, got none"):
+        load_scene(small_data, scale=("IMG_9", "IMG_8", 1.0))

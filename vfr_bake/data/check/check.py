@@ -16,7 +16,6 @@ from player.cameras.camera import Camera
 from player.cameras.colmap import colmap_folder
 from player.errors import ConfigError, DataError
 from player.progress import Progress
-from vfr_bake.data.capture import PosedImages
 from vfr_bake.data.check.looks import (
     MIN_SHARED,
     PictureMeasures,
@@ -31,12 +30,12 @@ from vfr_bake.data.files.archives import is_archive, unpack
 from vfr_bake.data.files.estimate_record import read_record
 from vfr_bake.data.files.listing import find_pictures, other_kinds
 from vfr_bake.data.files.masks import mask_of
-from vfr_bake.data.files.pictures import DescribedView, picture_size
+from vfr_bake.data.files.pictures import picture_size
 from vfr_bake.data.files.video import extract_frames
 from vfr_bake.data.folders import has_transforms, load_folder
 from vfr_bake.data.poses import added_since, connected, is_video, places
 from vfr_bake.data.quality.sharpness import blurred
-from vfr_bake.data.store.reading import PictureReader
+from vfr_bake.data.store.reading import DescribingReader
 from vfr_bake.data.store.working import WorkingSize
 
 PLAIN_FEATURES = 30
@@ -111,20 +110,6 @@ class _Set:
     cameras: list[Camera] = field(default_factory=list)
     why: dict[str, str] = field(default_factory=dict)
     """The reasons why pictures have no camera, by their names, as far as the estimation recorded them."""
-
-
-class _Describing(PictureReader):
-    """A reader that takes note of what is to be read, and reads nothing."""
-
-    described: Sequence[DescribedView] = ()
-
-    def read(self, described: Sequence[DescribedView], progress: Progress | None) -> PosedImages:
-        self.described = described
-        cameras = [view.camera for view in described]
-        blank = np.zeros((1, 1, 4), np.uint8)
-        return PosedImages(
-            cameras, [np.broadcast_to(blank, (camera.height, camera.width, 4)) for camera in cameras]
-        )
 
 
 def check_data(
@@ -202,7 +187,7 @@ def _listed(data: str, progress: Progress) -> _Set:
         folder = extract_frames(folder, progress)
     model = colmap_folder(folder) if folder.is_dir() else None
     if folder.is_dir() and (has_transforms(folder) or model is not None):
-        reader = _Describing()
+        reader = DescribingReader()
         load_folder(folder, None, reader)
         paths = [view.path for view in reader.described]
         masks = [view.mask for view in reader.described]

@@ -237,6 +237,20 @@ class PictureReader:
         (folder / cache.INDEX).write_bytes(cache.index_bytes(layout, cameras, n_channels, transparent))
 
 
+class DescribingReader(PictureReader):
+    """A reader that takes note of what is to be read, and reads nothing: all pictures are black."""
+
+    described: Sequence[DescribedView] = ()
+
+    def read(self, described: Sequence[DescribedView], progress: Progress | None) -> PosedImages:
+        self.described = described
+        cameras = [view.camera for view in described]
+        blank = np.zeros((1, 1, 4), np.uint8)
+        return PosedImages(
+            cameras, [np.broadcast_to(blank, (camera.height, camera.width, 4)) for camera in cameras]
+        )
+
+
 def held_bytes() -> int:
     """Return the number of bytes of pictures that may be held in memory."""
     return min(HELD_BYTES, allowed_bytes() // 4)
