@@ -74,8 +74,8 @@ class Bake:
     """The folder to write."""
     convert: bool = False
     """Bake nothing: rewrite an asset in the current version of the format, which takes fewer bytes and shows
-    a first picture early. Its pictures, head, mesh, cameras and reports stay what they are; of the settings
-    --max-memory alone has a meaning."""
+    a first picture early. Its pictures, head, cameras and reports stay what they are, and its mesh is made
+    again; of the settings --max-memory alone has a meaning."""
     config: BakeConfig = field(default_factory=BakeConfig)
     force: bool = False
     """Replace the folder if it exists, and holds an asset and nothing else."""

@@ -11,22 +11,29 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from exporters.formats.ply import parse_ply, ply_bytes
+from exporters.shapes.mesh import TriangleMesh
 from player.asset.asset import Asset
 from player.asset.pyramid import coarser
 from player.cameras.views import asset_cameras
 from player.render import Renderer
 from tests.version_3 import as_version_3
+from vfr_bake.baking.limits import file_sizes
 from vfr_bake.cli import bake_main
 
 
 @pytest.fixture
 def old(shells_folder: Path, tmp_path: Path) -> Path:
-    """The small asset of the tests in version 3.1, with a report."""
+    """The small asset of the tests in version 3.1, with a report, and a mesh as that version has it."""
     folder = as_version_3(Path(shutil.copytree(shells_folder, tmp_path / "old")))
-    data = b"{}"
-    (folder / "report.json").write_bytes(data)
+    up = np.tile([0.0, 0.0, 1.0], (3, 1))
+    mesh = ply_bytes(
+        TriangleMesh(np.eye(3), np.arange(3, dtype=np.int32)[None], up, np.full((3, 4), 255, np.uint8))
+    )
     document = json.loads((folder / "manifest.json").read_text())
-    document["files"]["report.json"] = {"bytes": 2, "sha256": hashlib.sha256(data).hexdigest()}
+    for name, data in (("report.json", b"{}"), ("mesh.ply", mesh)):
+        (folder / name).write_bytes(data)
+        document["files"][name] = {"bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()}
     (folder / "manifest.json").write_text(json.dumps(document))
     return folder
 
@@ -51,7 +58,7 @@ def test_the_finest_level_and_every_other_file_stay(
             vertices = after.pyramid.vertices
             rows = vertices[fine].rows(vertices[coarse].index * 2)
             assert np.array_equal(after.values[fine][rows[rows >= 0]], after.values[coarse][rows >= 0])
-    for name in ("head.onnx", "mesh.ply", "cameras.json", "report.json"):
+    for name in ("head.onnx", "cameras.json", "report.json"):
         assert one.read(name) == other.read(name)
     keys = ("generator", "aabb", "step", "n_fetches", "density_range", "background", "provenance", "near")
     assert all(getattr(one.manifest, key) == getattr(other.manifest, key) for key in keys)
@@ -61,6 +68,16 @@ def test_the_finest_level_and_every_other_file_stay(
     assert np.array_equal(x.opacity, y.opacity)
     # where no fine brick is, a fetch between two surfaces reads a coarser brick that reaches that far
     assert np.square(x.rgb - y.rgb).mean() < 1e-5 and np.abs(x.rgb - y.rgb).max() < 0.1
+
+
+def test_the_mesh_becomes_as_small_as_a_baked_one(old: Path, tmp_path: Path) -> None:
+    assert bake_main(["--convert", str(old), str(tmp_path / "new")]) == 0
+    before, after = ((folder / "mesh.ply").read_bytes() for folder in (old, tmp_path / "new"))
+    assert b"property float nx" in before and b"property uchar alpha" in before
+    header = after[: after.index(b"end_header")]
+    assert b"nx" not in header and b"alpha" not in header
+    assert len(parse_ply(after, "mesh.ply").faces)
+    assert len(after) <= 0.1 * sum(file_sizes(tmp_path / "new").values())
 
 
 def test_converting_again_changes_nothing(old: Path, tmp_path: Path) -> None:

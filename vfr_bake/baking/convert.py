@@ -1,5 +1,6 @@
 """Convert an asset to the current version of the format, without the model. The values stay the same, take
-fewer bytes, and get coarser levels beneath, so that the asset's first part already shows a picture."""
+fewer bytes, and get coarser levels beneath, so that the asset's first part already shows a picture. The mesh
+is made again, as the bake makes it, because meshes of earlier versions have any size."""
 
 from __future__ import annotations
 
@@ -7,10 +8,15 @@ import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from exporters.formats.ply import small_ply_bytes
+from exporters.surface.few_faces import RESOLUTION
 from player.asset.asset import Asset, GridArrays, write_asset
 from player.asset.target import check_asset_target
-from player.progress import Progress
+from player.files.memory import allowed_bytes
+from player.progress import Progress, silent
 from vfr_bake.baking.coarser_levels import with_coarser_levels
+from vfr_bake.baking.limits import file_sizes
+from vfr_bake.baking.mesh import bake_mesh, mesh_bytes
 
 STEPS = 6
 """Number of steps that are reported to `progress`."""
@@ -32,7 +38,8 @@ def convert(
 ) -> Converted:
     """Write the asset in `old`, of version 3 or 4, to the folder `new` as version 4.
 
-    Head, mesh, cameras, reports and settings stay unchanged, and so does every value of the finest level.
+    Head, cameras, reports and settings stay unchanged, and so does every value of the finest level. The mesh
+    is made again.
 
     Args:
         old: the folder of an asset; every file in it has to be complete.
@@ -62,9 +69,19 @@ def convert(
         manifest = replace(manifest, level_steps=steps, density_steps=steps)
     if len(manifest.feature_steps) < len(features.values):
         manifest = replace(manifest, feature_steps=(1,) * len(features.values))
-    head, mesh, cameras = (asset.read(name) for name in ("head.onnx", "mesh.ply", "cameras.json"))
+    head, cameras = asset.read("head.onnx"), asset.read("cameras.json")
     reports = {name: asset.read(name) for name in asset.manifest.files if name.startswith("report.")}
-    write_asset(new, manifest, GridArrays(densities, features), head, mesh, cameras, force, lambda _: reports)
+
+    def finish(folder: Path) -> dict[str, bytes]:
+        """Return the mesh and the reports as files."""
+        tell(4, STEPS)
+        sizes = file_sizes(folder)
+        most = mesh_bytes(sum(sizes.values()) - sizes["mesh.ply"], None)
+        written = Asset.open(folder, max_memory=max_memory)
+        baked = bake_mesh(written, RESOLUTION, most, allowed_bytes(max_memory) / 1e9, silent)
+        return reports | {"mesh.ply": small_ply_bytes(baked.mesh)}
+
+    write_asset(new, manifest, GridArrays(densities, features), head, b"", cameras, force, finish)
     tell(STEPS, STEPS)
     n_bytes = sum(path.stat().st_size for path in new.iterdir())
     return Converted(asset, n_bytes, time.perf_counter() - begin)

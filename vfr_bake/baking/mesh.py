@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from exporters.formats.ply import small_ply_size
 from exporters.shapes.mesh import TriangleMesh
 from exporters.surface.asset_surface import AssetSurface, Removed
 from exporters.surface.depth_views import FEW_PIXELS
@@ -20,8 +21,6 @@ VIEWS = 50
 """Most views that are rendered for the mesh."""
 OTHERS = 9
 """Bytes of the other files for each byte of the mesh, which is thus at most a tenth of the asset."""
-FEWEST_BYTES = 43_000
-"""Bytes that the mesh of every asset may take: enough for about 2,000 faces."""
 
 
 class BakedMesh(NamedTuple):
@@ -58,8 +57,11 @@ def bake_mesh(asset: Asset, resolution: int, max_bytes: int, max_memory: float, 
     try:
         surface = AssetSurface(inner, report, FEW_PIXELS, VIEWS)
         mesh, removed = few_faces(surface, resolution, max_bytes)
-    except (ConfigError, DataError):  # no surface at the density level, or no camera sees it
-        return BakedMesh(*empty, "all of it: nowhere is the field dense enough for a surface")
+        if small_ply_size(len(mesh.vertices), len(mesh.faces)) > max_bytes:
+            raise DataError("mesh: expected fewer faces, got more than fit")  # Open3D is not installed
+    except (ConfigError, DataError):  # no surface at the density level, no camera sees it, or it does not fit
+        why = f"nowhere is the field dense enough for a surface, or none fits into {max_bytes:,} bytes"
+        return BakedMesh(*empty, f"all of it: {why}")
     outside = "all surfaces outside the unit ball of the model frame" if asset.manifest.contracted else None
     return BakedMesh(surface.painted(mesh), removed, outside)
 
@@ -72,9 +74,7 @@ def mesh_bytes(others: int, max_mb: float | None) -> int:
         max_mb: megabytes that the whole asset may take; None for no limit.
 
     >>> mesh_bytes(9_000_000, None), mesh_bytes(9_000_000, 9.5), mesh_bytes(9_000_000, 8.0)
-    (1000000, 500000, 43000)
+    (1000000, 500000, 0)
     """
-    most = others // OTHERS
-    if max_mb is not None:
-        most = min(most, int(max_mb * 1e6) - others)
-    return max(most, FEWEST_BYTES)
+    left = np.inf if max_mb is None else max(int(max_mb * 1e6) - others, 0)
+    return int(min(others // OTHERS, left))

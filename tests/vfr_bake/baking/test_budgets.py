@@ -19,7 +19,6 @@ from player.kept_code import is_kept
 from player.page.gpu_memory import TILE, gpu_bytes
 from player.progress import silent
 from tests.exporters.meshes import read_ply
-from vfr_bake.baking import mesh as baked_mesh
 from vfr_bake.baking.bake import _Bake, bake
 from vfr_bake.baking.cells import FLOORS, Resolutions
 from vfr_bake.baking.grids import Layout
@@ -400,10 +399,7 @@ def test_more_work_is_expected_to_take_longer(model: Model) -> None:
 
 
 @pytest.mark.needs("open3d")
-def test_the_mesh_is_at_most_a_tenth_of_the_asset(
-    model: Model, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(baked_mesh, "FEWEST_BYTES", 5_000)
+def test_the_mesh_is_at_most_a_tenth_of_the_asset(model: Model, tmp_path: Path) -> None:
     settings = BakeConfig(resolution=96, mesh_resolution=0, refine_steps=0, check_views=1)
     result = bake(model, tmp_path / "asset", settings, silent)
     asset = Asset.open(tmp_path / "asset", verify=True)
