@@ -32,7 +32,7 @@ class Train:
     cameras: transforms_train.json (NeRF-synthetic), transforms.json or a COLMAP model (sparse/0); or `demo`,
     the built-in scene."""
     model: Positional[Path | None] = None
-    """The model file to write, for example model.pt; none with --check."""
+    """The model file to write, for example model.pt; with --check it is not written, and may be left out."""
     check: bool = False
     """Train nothing: look at the pictures for some ten seconds, and say what is likely to come out and what
     to photograph in addition. Writes a page, with --json the same as data."""

@@ -39,8 +39,9 @@ N_LEARNED = 10_000
 GLANCED_AT = 24
 """Most pictures that a run looks at before it begins; `--check` looks at as many as ten seconds allow."""
 
-USED_BY_CHECK = ("data", "check", "html", "force", "json", "max_side", "downscale")
-"""The options that have an effect with `--check`."""
+USED_BY_CHECK = ("data", "model", "check", "html", "force", "json", "max_side", "downscale")
+"""What may be given with `--check`: the options that have an effect, and the model that training would write,
+so that `--check` can be put behind the command first."""
 
 
 def train_command(options: Any) -> int:
@@ -108,8 +109,6 @@ def _misused(options: Any) -> str:
         if options.model is None:
             return "expected a model file to write, or --check; see vfr-train --help"
         return "" if options.html is None else "--html: does nothing without --check"
-    if options.model is not None:
-        return printable(f"{options.model}: expected no model file with --check, which trains nothing")
     lost = [name for name in _given(options) if name not in USED_BY_CHECK]
     return f"--{lost[0].replace('_', '-')}: does nothing with --check, which trains nothing" if lost else ""
 

@@ -37,7 +37,7 @@ def interrupt(*_: Any) -> None:
     ("options", "message"),
     [
         (["MODEL", "--html", "page.html"], "--html: does nothing without --check"),
-        (["MODEL", "--check"], "model.pt: expected no model file with --check, which trains nothing"),
+        (["MODEL", "--check", "--steps", "5"], "--steps: does nothing with --check"),
         *(
             (["--check", "--max-side", "240", *words], f"{words[0]}: does nothing with --check")
             for words in (
