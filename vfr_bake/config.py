@@ -336,9 +336,10 @@ USUAL_MEMORY = 4.0
 class BakeConfig:
     """Settings of the bake. Those that are not given follow from the preset."""
 
-    preset: Preset = "balanced"
+    preset: Preset | None = None
     """Fidelity: for final pictures, nearly the model's own. Balanced: small and quick to play. Fast: fewer
-    bytes and a smaller head. Phone: the fewest bytes, for pages on phones."""
+    bytes and a smaller head. Phone: the fewest bytes, for pages on phones. Not given: balanced, or fidelity
+    if --max-loss-db is less than the loss that balanced aims at."""
     resolution: int | None = None
     """Cells per axis of the baked densities, at most half again the field's finest level."""
     feature_resolution: int | None = None
@@ -370,13 +371,17 @@ class BakeConfig:
     """The mesh gets the faces that a grid of so many voxels along the box would give it; 0: as many as its
     bytes allow, a tenth of the asset's."""
     max_loss_db: float | None = None
-    """Fail, and write nothing, if the written files lose more than this against photographs."""
+    """Take the fewest bytes that lose at most this against photographs; fail, and write nothing, if the
+    written files lose more all the same. Without --preset, a limit of less than 0.4 (unbounded scenes 0.5)
+    takes fidelity."""
     max_mb: float | None = None
-    """Store as much of each value as fits into this many megabytes, the report not counted; fail, and write
-    nothing, if the asset takes more all the same."""
+    """Store the values less precisely than the preset does, on coarser grids if need be, until the asset fits
+    into this many megabytes, the report not counted; fail, and write nothing, if it takes more all the
+    same."""
     target_ms: float | None = None
-    """Take no wider a head and no more lookups than a frame of 800x800 in so many milliseconds allows,
-    measured by the player on this machine; fail, and write nothing, if it takes longer all the same."""
+    """Take no wider a head, no more lookups and no finer grids than a frame of 800x800 in so many
+    milliseconds allows, measured by the player on this machine; fail, and write nothing, if it takes longer
+    all the same."""
     max_memory: float | None = None
     """Gigabytes of memory that the bake may take: with less, the bake learns from fewer rays and its grids
     are coarser. Not given: 4, or half of the machine's memory if that is less."""
@@ -385,7 +390,7 @@ class BakeConfig:
     pictures; 1 to 1,000; the more views, the fewer pixels of each are compared."""
 
     def __post_init__(self) -> None:
-        check(self, "preset", self.preset in PRESETS, f"one of {tuple(PRESETS)}")
+        check(self, "preset", self.preset is None or self.preset in PRESETS, f"one of {tuple(PRESETS)}")
         check(self, "resolution", self.resolution is None or 8 <= self.resolution <= 2048, "8 to 2048")
         most = self.resolution or 2048
         fits = self.feature_resolution is None or 8 <= self.feature_resolution <= most
@@ -424,14 +429,21 @@ class BakeConfig:
         (3, 12)
         >>> BakeConfig().choice(unbounded=True).refine_steps
         2100
+        >>> BakeConfig().choice().preset, BakeConfig(max_loss_db=0.1).choice().preset
+        ('balanced', 'fidelity')
         """
-        preset = PRESETS[self.preset]
-        if unbounded:
-            preset = replace(preset, **UNBOUNDED[self.preset])
+        preset = _choice(self.preset or "balanced", unbounded)
+        if self.preset is None and self.max_loss_db is not None and self.max_loss_db < preset.target_loss_db:
+            preset = _choice("fidelity", unbounded)
         given = {name: getattr(self, name, None) for name in BakeChoice.__dataclass_fields__}
         given["n_fetches"] = None if self.k == "auto" else self.k
         choice = replace(preset, **{name: value for name, value in given.items() if value is not None})
         return choice if choice.refine_steps else replace(choice, head_width=0)
+
+
+def _choice(preset: Preset, unbounded: bool) -> BakeChoice:
+    """Return what `preset` chooses for an object or an unbounded scene."""
+    return replace(PRESETS[preset], **UNBOUNDED[preset]) if unbounded else PRESETS[preset]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -12,6 +12,7 @@ Preset = Literal["fidelity", "balanced", "fast", "phone"]
 class BakeChoice:
     """Settings that a preset chooses; those that the user gives replace them."""
 
+    preset: Preset
     cells_per_pixel: float
     """Resolution of the densities if none is given: cells for each pixel that the training pictures have
     across the middle of the box; at most one and a half times the field's finest level."""
@@ -58,12 +59,13 @@ class BakeChoice:
     """Loss in dB that the preset aims at."""
     page_mb: float
     """Graphics memory in MB, roughly, that the grids may take in a page before any detail is dropped: they
-    are as fine as fits, unless their resolution was given. Pages of the phone preset are meant to take 256
-    MB, because more than half of their features' detail is dropped."""
+    are as fine as fits, unless their resolution was given. With the phone preset it is more than PAGE_MB,
+    because more than half of the features' detail is dropped afterwards."""
 
 
 PRESETS: dict[Preset, BakeChoice] = {
     "fidelity": BakeChoice(
+        preset="fidelity",
         cells_per_pixel=1.95, contracted_resolution=1536, feature_share=0.68, culled_loss_db=0.02,
         n_channels=22, channel_loss_db=0.03, n_fetches=16, sample_loss_db=0.005,
         code_loss_db=0.02, density_step=2, code_levels=127, head_width=0, head_layers=3,
@@ -71,6 +73,7 @@ PRESETS: dict[Preset, BakeChoice] = {
         page_mb=1024,
     ),
     "balanced": BakeChoice(
+        preset="balanced",
         cells_per_pixel=1.65, contracted_resolution=1408, feature_share=0.775, culled_loss_db=0.06,
         n_channels=16, channel_loss_db=0.15, n_fetches=12, sample_loss_db=0.05,
         code_loss_db=0.13, density_step=4, code_levels=50, head_width=64, head_layers=3,
@@ -78,6 +81,7 @@ PRESETS: dict[Preset, BakeChoice] = {
         page_mb=512,
     ),
     "fast": BakeChoice(
+        preset="fast",
         cells_per_pixel=1.55, contracted_resolution=640, feature_share=0.68, culled_loss_db=0.1,
         n_channels=16, channel_loss_db=0.25, n_fetches=12, sample_loss_db=0.1,
         code_loss_db=0.67, density_step=6, code_levels=50, head_width=48, head_layers=1,
@@ -85,6 +89,7 @@ PRESETS: dict[Preset, BakeChoice] = {
         page_mb=512,
     ),
     "phone": BakeChoice(
+        preset="phone",
         cells_per_pixel=1.45, contracted_resolution=1280, feature_share=0.68, culled_loss_db=0.1,
         n_channels=16, channel_loss_db=0.25, n_fetches=8, sample_loss_db=0.3,
         code_loss_db=0.4, density_step=6, code_levels=50, head_width=32, head_layers=1,
@@ -92,6 +97,9 @@ PRESETS: dict[Preset, BakeChoice] = {
         page_mb=384,
     ),
 }  # fmt: skip
+
+PAGE_MB: dict[Preset, int] = {"fidelity": 1024, "balanced": 512, "fast": 512, "phone": 256}
+"""Graphics memory in MB that a page of the finished asset should take at most."""
 
 UNBOUNDED: dict[Preset, dict[str, Any]] = {
     "fidelity": {"refine_steps": 400, "feature_share": 1.0, "n_channels": 24},

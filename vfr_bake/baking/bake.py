@@ -63,6 +63,7 @@ from vfr_bake.baking.limits import (
     file_sizes,
     frame_ms,
     keep_to_time,
+    page_memory,
     unwritten_asset,
 )
 from vfr_bake.baking.mesh import OTHERS, bake_mesh, mesh_bytes
@@ -100,7 +101,7 @@ class BakeResult:
     """Loss against photographs, compared with the trained model."""
     figures: dict[str, Any]
     missed: list[str]
-    """The targets of the preset that were missed, in words."""
+    """The targets that were missed, in words."""
 
 
 def bake(model: Model, folder: Path, config: BakeConfig, report: Report, force: bool = False) -> BakeResult:
@@ -181,7 +182,7 @@ class _Bake:
             "n_feature_vertices": int(arrays.features.first_rows[-1]),
             "stages": self.held_out.table(),
         }
-        missed: list[str] = []
+        made: list[BakeReport] = []
 
         def finish(new: Path) -> dict[str, bytes]:
             """Return the mesh and the report as files; the mesh comes last because its size limit depends on
@@ -191,7 +192,7 @@ class _Bake:
             figures["mesh_faces"], figures["mesh_floaters_removed"] = len(mesh.faces), removed.floaters
             data = small_ply_bytes(mesh)
             report = self._judge(asset, file_sizes(new) | {"mesh.ply": len(data)}, folder.name)
-            missed.extend(report.missed)
+            made.append(report)
             return {"mesh.ply": data, "report.json": report.json(), "report.html": report.html()}
 
         with self._part(LAST_PART):
@@ -202,8 +203,9 @@ class _Bake:
         figures |= {"psnr_to_full_model": last.psnr, "loss_db": last.loss.db, "time": self.seconds}
         figures |= {"loss_db_spread": last.loss.stated}
         figures |= {"stages": self.held_out.table(), "left_out": self.left_out}
+        figures["gpu_bytes"] = made[0].gpu_bytes
         n_bytes, seconds = sum(file_sizes(folder).values()), sum(self.seconds.values())
-        return BakeResult(figures["n_vertices"], n_bytes, seconds, last.loss, figures, missed)
+        return BakeResult(figures["n_vertices"], n_bytes, seconds, last.loss, figures, made[0].missed)
 
     def _cells(self) -> tuple[Layout, int]:
         """Return the layout of the stored densities and features, and the number of training rays for which
@@ -434,18 +436,26 @@ class _Bake:
         megabytes = sum(n_bytes.values()) / 1e6
         timed = self.config.target_ms is not None
         ms = frame_ms(asset, self.model.cameras[0], self.n_fetches) if timed else None
-        check_budget(self.config, last.loss.db, megabytes, ms)
-        missed = []
-        if last.loss.least > self.choice.target_loss_db:
+        check_budget(self.config, last.loss, megabytes, ms)
+        preset = self.choice.preset
+        gpu_bytes, missed = page_memory(asset, preset)
+        if last.loss.spread is None:
+            if self.config.max_loss_db is not None:
+                missed.append(
+                    f"loss: expected at most {self.config.max_loss_db:g} dB, which could not be measured, "
+                    "because the model has no witnesses"
+                )
+        elif last.loss.least > self.choice.target_loss_db:
             missed.append(
-                f"preset {self.config.preset}: expected a loss of at most {self.choice.target_loss_db:g} dB, "
+                f"preset {preset}: expected a loss of at most {self.choice.target_loss_db:g} dB, "
                 f"got {last.loss}"
             )
         pictures = list(side_by_side(self.model, asset))
         seconds = self.seconds | {LAST_PART: time.monotonic() - self._begun - sum(self.seconds.values())}
         return BakeReport(
-            f"{name}: baked with preset {self.config.preset}", self._asked(), self.held_out.table(),
-            self.held_out.measured_on(), n_bytes, seconds, self.left_out, self.lookups, missed, pictures,
+            f"{name}: baked with preset {preset}", self._asked(), self.held_out.table(),
+            self.held_out.measured_on(), n_bytes, seconds, self.left_out, self.lookups, missed, gpu_bytes,
+            pictures,
         )  # fmt: skip
 
     @contextmanager

@@ -15,10 +15,12 @@ import numpy as np
 from player.asset.asset import Asset, GridArrays
 from player.asset.manifest import Manifest, file_entry
 from player.cameras.camera import Camera
-from player.errors import TrainingError
+from player.errors import FormatError, TrainingError
+from player.page.gpu_memory import gpu_bytes
 from player.render import Renderer
 from vfr_bake.config import BakeConfig
-from vfr_bake.presets import BakeChoice
+from vfr_bake.presets import PAGE_MB, BakeChoice, Preset
+from vfr_bake.training.length.witness_loss import Loss
 
 MANIFEST_BYTES = 20_000
 """Bytes reserved for the manifest if the asset has to fit into a number of bytes."""
@@ -73,18 +75,33 @@ def file_sizes(folder: Path) -> dict[str, int]:
     return {path.name: path.stat().st_size for path in paths}
 
 
-def check_budget(config: BakeConfig, loss_db: float, megabytes: float, ms: float | None) -> None:
+def page_memory(asset: Asset, preset: Preset) -> tuple[int | None, list[str]]:
+    """Return the bytes of graphics memory that a page of the asset takes, None if there can be no page of it;
+    and in words what was missed if that is more than the preset should take."""
+    try:
+        n_bytes = gpu_bytes(asset)
+    except FormatError as error:
+        return None, [f"page: {error}: lower --resolution to make pages"]
+    if n_bytes <= 1e6 * PAGE_MB[preset]:
+        return n_bytes, []
+    return n_bytes, [
+        f"preset {preset}: expected a page that takes at most {PAGE_MB[preset]} MB of graphics memory, got "
+        f"{n_bytes / 1e6:.0f} MB: lower --resolution, or export with --max-gpu-mb {-(-n_bytes // 10**6)}"
+    ]
+
+
+def check_budget(config: BakeConfig, loss: Loss, megabytes: float, ms: float | None) -> None:
     """Raise TrainingError if the written files miss a limit; the message says what they reach. `ms` is the
-    frame time, or None if it was not limited."""
+    frame time, or None if it was not limited. A loss that is only expected, not measured, misses none."""
     limits = (
-        ("loss", config.max_loss_db, loss_db, "dB"),
+        ("loss", config.max_loss_db, None if loss.spread is None else loss.db, "dB"),
         ("size", config.max_mb, megabytes, "MB"),
         ("time", config.target_ms, ms, "ms"),
     )
     for name, limit, got, unit in limits:
         if limit is not None and got is not None and got > limit:
             raise TrainingError(
-                f"bake: {name}: expected at most {limit:g} {unit}, got {got:.2f} {unit} ({loss_db:.2f} dB in "
+                f"bake: {name}: expected at most {limit:g} {unit}, got {got:.2f} {unit} ({loss.db:.2f} dB in "
                 f"{megabytes:.1f} MB): nothing was written: allow more, or change the preset"
             )
 

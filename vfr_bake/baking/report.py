@@ -77,12 +77,14 @@ class BakeReport:
     the number was given."""
     missed: list[str]
     """The targets that were missed, in words; empty if all were met."""
+    gpu_bytes: int | None
+    """Bytes of graphics memory that a page of the asset takes; None if there can be no page of it."""
     pictures: list[Pictures] = field(default_factory=list)
     """Pictures of the full model and of the asset."""
 
     def json(self) -> bytes:
         """Return the content of report.json."""
-        names = ("asked", "stages", "measured_on", "seconds", "left_out", "lookups", "missed")
+        names = ("asked", "stages", "measured_on", "seconds", "left_out", "lookups", "missed", "gpu_bytes")
         document = {name: getattr(self, name) for name in names} | {"bytes": self.n_bytes}
         document |= {name: self.stages[-1][name] for name in ("loss_db", "loss_db_spread")}
         return (json.dumps(document, indent=1, sort_keys=True, allow_nan=False) + "\n").encode()
@@ -91,6 +93,9 @@ class BakeReport:
         """Return the content of report.html."""
         last = self.stages[-1]
         megabytes = sum(self.n_bytes.values()) / 1e6
+        of_page = ""
+        if self.gpu_bytes is not None:
+            of_page = f" A page of it takes {self.gpu_bytes / 1e6:.0f} MB of graphics memory."
         lookups = f"<h2>Lookups a ray: loss against all</h2>{bars(self.lookups, 'dB', 3)}"
         measured = last["loss_db_spread"] is not None
         loss = "loss" if measured else "expected loss"
@@ -106,7 +111,7 @@ class BakeReport:
             self.title,
             f"<p>{megabytes:.1f} MB, baked in {sum(self.seconds.values()):.0f} s; the written files play "
             f"{last['psnr']:.1f} dB from the model's own pictures, {'a' if measured else 'an'} {loss} of "
-            f"{last['loss_db']:.2f} dB{spread} against photographs. {escape(self.measured_on)}</p>",
+            f"{last['loss_db']:.2f} dB{spread} against photographs. {escape(self.measured_on)}{of_page}</p>",
             *(f'<p class="missed">Missed: {escape(text)}</p>' for text in self.missed),
             "<h2>Loss, stage by stage</h2>",
             bars({stage["name"]: stage["loss_db"] for stage in self.stages}, "dB", 3),

@@ -33,6 +33,9 @@ def bake_command(options: Any) -> int:
 
     model = load_model(options.model, options.config.memory)
     check_bakeable(model, options.config)
+    preset = options.config.choice(model.field.config.unbounded).preset
+    if options.config.preset is None and preset != BakeConfig().choice().preset:
+        _say(f"--max-loss-db {options.config.max_loss_db:g} is less than balanced aims at: preset {preset}")
     plan = make_plan(model, options.config)
     minutes = expected_seconds(model, options.config, plan) / 60
     fine, coarse = plan.resolutions
@@ -62,7 +65,7 @@ def bake_command(options: Any) -> int:
             "own pictures: train again to have it measured against photographs"
         )
     for missed in result.missed:
-        _say(f"warning: {missed}: see report.html for where it goes")
+        _say(f"warning: {missed} (see report.html)")
     return 0
 
 

@@ -21,6 +21,7 @@ from player.cameras.camera import orbit
 from player.errors import ConfigError, OutputError, TrainingError
 from player.march.fetches import MIN_TOTAL
 from player.march.march import march
+from player.page.gpu_memory import gpu_bytes
 from player.render import render
 from tests.exporters.meshes import read_ply
 from tests.numerics.fog import fog
@@ -380,6 +381,7 @@ def test_the_report_adds_up(model: Model, tmp_path: Path) -> None:
             assert (tmp_path / "asset" / name).stat().st_size == size
     assert sum(said["bytes"].values()) <= result.n_bytes
     assert said["seconds"].keys() == result.figures["time"].keys(), "the report's own part is among them"
+    assert said["gpu_bytes"] == result.figures["gpu_bytes"] == gpu_bytes(Asset.open(tmp_path / "asset"))
     assert said["asked"]["n_channels"] == PRESETS["fast"].n_channels and "channels" in said["left_out"]
     page = (tmp_path / "asset" / "report.html").read_text()
     assert page.count("data:image/png;base64,") == 2 and "<svg" in page

@@ -22,12 +22,13 @@ from tests.exporters.meshes import read_ply
 from vfr_bake.baking.bake import _Bake, bake
 from vfr_bake.baking.cells import FLOORS, Resolutions
 from vfr_bake.baking.grids import Layout
-from vfr_bake.baking.limits import file_sizes, keep_to_time
+from vfr_bake.baking.limits import RESERVE, file_sizes, keep_to_time
 from vfr_bake.baking.mesh import bake_mesh
 from vfr_bake.baking.plan import (
     CHOSEN_COST,
     COMPILE_SECONDS,
     CULLING_BYTES,
+    FASTER,
     FEW_DRAWN,
     FEWEST_RAYS,
     HEAD_COST,
@@ -105,6 +106,41 @@ def test_a_frame_that_takes_too_long_is_an_error_and_writes_nothing(
     with pytest.raises(TrainingError, match=r"bake: time: expected at most 5 ms, got 9\.00 ms"):
         bake(model, tmp_path / "asset", BakeConfig(target_ms=5, **SMALL), silent)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_grids_and_steps_become_coarser_where_frames_take_too_long(
+    model: Model, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A machine takes a millisecond for each cell along an axis, whatever the head. The first coarser grids
+    reach the time that was asked for."""
+    config = BakeConfig(mesh_resolution=16, refine_steps=0, check_views=1)
+    fine = make_plan(model, config).resolutions.densities
+    monkeypatch.setattr("vfr_bake.baking.bake.frame_ms", lambda asset, *_: float(asset.manifest.resolution))
+    monkeypatch.setattr("vfr_bake.baking.bake.COARSEST", 8)
+    config = replace(config, target_ms=0.65 * fine / RESERVE)
+    result = bake(model, tmp_path / "asset", config, silent)
+    made = Asset.open(tmp_path / "asset").manifest
+    assert made.resolution == int(FASTER * fine) and made.step == pytest.approx(model.occupancy.step / FASTER)
+    assert [stage["name"] for stage in result.figures["stages"]].count("grid") == 1
+    said = result.figures["left_out"]["resolution"]
+    assert said.startswith(f"{made.resolution} cells along") and f"frames of {config.target_ms:g} ms" in said
+    monkeypatch.setattr("vfr_bake.baking.bake.COARSEST", fine)
+    with pytest.raises(TrainingError, match="with the fewest lookups and the smallest head"):
+        bake(model, tmp_path / "other", config, silent)
+
+
+def test_a_loss_that_is_not_measured_misses_nothing(
+    model: Model, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A model without witnesses is baked within any limit of the loss, and the bake says that the loss could
+    not be measured. No loss that is only expected is warned of."""
+    monkeypatch.setitem(PRESETS, "balanced", replace(PRESETS["balanced"], target_loss_db=1e-6))
+    old = replace(model, witnesses=None, training_pixels=None)
+    result = bake(old, tmp_path / "a", BakeConfig(preset="balanced", **SMALL), silent)
+    assert result.loss.db > 1e-6 and result.loss.spread is None and result.missed == []
+    result = bake(old, tmp_path / "b", BakeConfig(max_loss_db=1e-6, **SMALL), silent)
+    (missed,) = result.missed
+    assert missed.startswith("loss: expected at most 1e-06 dB, which could not be measured")
 
 
 @pytest.mark.parametrize("target_ms", [None, 50.0])

@@ -25,6 +25,7 @@ def report(**changes: object) -> BakeReport:
         "left_out": {"head": "256 wide, this one is <64>"},
         "lookups": {"1": 0.5, "2": 0.125},
         "missed": [],
+        "gpu_bytes": 40_000_000,
         "pictures": [Pictures("view", np.zeros((8, 9, 3)), np.ones((8, 9, 3)))],
     }
     return BakeReport(**(parts | changes))  # type: ignore[arg-type]
