@@ -28,7 +28,7 @@ from player.asset.asset import Asset, GridArrays, write_asset
 from player.asset.manifest import Manifest
 from player.asset.target import check_asset_target
 from player.cameras.transforms import write_cameras
-from player.errors import ConfigError
+from player.errors import ConfigError, TrainingError
 from player.files.memory import give_back
 from player.head.head import Head
 from player.progress import Report
@@ -85,6 +85,8 @@ feature space that the colours depend on, and the second moment of the features.
 DETAIL_SHARE = 0.5
 """Share of what is left of the loss that was asked for, which giving up detail may lose at most; rounding the
 values that stay loses the rest."""
+COARSEST = 64
+"""Cells along an axis below which grids do not become coarser for frames to take less time."""
 LAST_PART = "writing and checking"
 """The part of a bake in which the report is made."""
 
@@ -148,9 +150,12 @@ class _Bake:
     def run(self, folder: Path, force: bool) -> BakeResult:
         layout, n_rays = self._cells()
         stored, teacher, again = self._store(layout, n_rays)
-        if self.config.target_ms is not None:
-            with self._part("pace"):
-                self.choice = self._in_time(stored, layout, self.config.target_ms)
+        while not self._is_in_time(stored, layout):
+            del layout, stored, teacher, again  # free memory for the coarser ones
+            self.plan = self.plan.coarser()
+            self.held_out.stages.clear()
+            layout, n_rays = self._cells()
+            stored, teacher, again = self._store(layout, n_rays)
         left = refinement_seconds(self.choice, time.monotonic() - self._begun)
         tuning = Tuning(self.config, self.choice, self.held_out, self._report, left)
         with self._part("refinement"):
@@ -223,14 +228,16 @@ class _Bake:
         fitted = fit_cells(visible, plan.resolutions, most)
         unbounded, resolutions = model.field.config.unbounded, fitted.resolutions
         if resolutions == plan.resolutions:
-            _, room = limits[0]  # memory alone limits a plan
+            _, room = limits[0]  # memory alone limits a plan, or the time of a frame
+        if plan.longer > 1:
+            room = f"frames of {self.config.target_ms:g} ms"
         if resolutions != plan.wanted:
             self.left_out["resolution"] = (
                 f"{resolutions.densities} cells along an axis for densities, {resolutions.features} for "
                 f"features, in place of {plan.wanted.densities} and {plan.wanted.features}: more do not fit "
                 f"into {room}; part of the loss after 'grid'"
             )
-            step = lattice_step(resolutions.densities) if unbounded else step
+            step = lattice_step(resolutions.densities) if unbounded else step * plan.longer
         near = 0.0 if isinstance(model.sampler, OccupancyGrid) else model.sampler.near
         layout = make_layout(fitted.cells, step, resolutions, unbounded, near, self.choice.density_step)
         return layout, plan.n_rays(fitted.n_cells)
@@ -374,9 +381,27 @@ class _Bake:
         head = 0 if self.choice.head_width else n_weights * self.choice.head_bits // 8
         return mesh + len(write_cameras(self.model.cameras)) + head
 
+    def _is_in_time(self, stored: Stored, layout: Layout) -> bool:
+        """Narrow the head and take fewer feature lookups, as far as it takes to render a frame in the time
+        that was asked for. Return whether that is enough.
+
+        Raises TrainingError if it is not, and the grids cannot become coarser.
+        """
+        config = self.config
+        if config.target_ms is None:
+            return True
+        try:
+            with self._part("pace"):
+                self.choice = self._in_time(stored, layout, config.target_ms)
+        except TrainingError:
+            if config.resolution or config.feature_resolution or min(self.plan.resolutions) < COARSEST:
+                raise
+            return False
+        return True
+
     def _in_time(self, stored: Stored, layout: Layout, target_ms: float) -> BakeChoice:
         """Return the preset's choice with the head narrowed and the feature lookups reduced as far as it
-        takes to render a frame in `target_ms`."""
+        takes to render a frame in `target_ms`. Raises TrainingError if it takes longer all the same."""
         arrays = layout.finest(stored.density, stored.features)
         scale = np.ones(arrays.features.n_channels)
 

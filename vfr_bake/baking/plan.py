@@ -51,6 +51,8 @@ training pixels all lie on it or close to it; of its other rays only a third mee
 RAYS_SHARE = 0.3
 """Share of the memory for cells and rays that is reserved for the rays, if they need it."""
 FEWEST_RAYS = 100_000
+FASTER = 0.6
+"""Factor on the resolutions, and on the number of march steps of a ray, if frames take too long."""
 RAYS_OF_CELL = 2.0
 """Training rays for each stored cell of the features' grid."""
 RAY_BYTES = {False: 220, True: 120}
@@ -122,6 +124,8 @@ class Plan:
     """Cells that fit into a page of the asset; infinite if the resolution was given."""
     most_rays: int
     """The most training rays that refinement has use for."""
+    longer: float = 1.0
+    """Factor by which the march steps are longer than usual, so that frames take less time."""
 
     @property
     def ray_bytes(self) -> int:
@@ -140,6 +144,12 @@ class Plan:
         them."""
         left = (self.room - n_cells * self.cell_bytes) / self.ray_bytes
         return int(np.clip(min(left, RAYS_OF_CELL * n_cells), FEWEST_RAYS, self.most_rays))
+
+    def coarser(self) -> Plan:
+        """Return the plan of a bake whose frames take less time: with coarser grids and longer steps."""
+        fine, coarse = (int(FASTER * n) for n in self.resolutions)
+        coarse -= coarse % BLOCK if self.unbounded else 0
+        return replace(self, resolutions=Resolutions(fine, coarse), longer=self.longer / FASTER)
 
     @property
     def n_bytes(self) -> int:
