@@ -135,7 +135,7 @@ def page(title: str, *parts: str) -> bytes:
         f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{title}</title>'
         f"<style>{STYLE}</style></head><body><h1>{title}</h1>{''.join(parts)}</body></html>\n"
     )
-    return text.encode()
+    return text.encode(errors="replace")  # names of files on Linux may have no UTF-8
 
 
 def table(rows: Iterable[str]) -> str:

@@ -67,6 +67,11 @@ def test_the_page_is_whole_and_escapes_what_it_is_given() -> None:
     assert "Missed" not in report().html().decode()
 
 
+def test_a_name_that_is_no_text() -> None:
+    """A folder's name that is not UTF-8, as Linux allows, is shown with question marks."""
+    assert "<h1>b?ke</h1>" in report(title="b\udce4ke").html().decode()
+
+
 def test_the_json_says_the_same() -> None:
     said = json.loads(report().json())
     assert [stage["name"] for stage in said["stages"]] == ["grid", "files"]
