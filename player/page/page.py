@@ -1,25 +1,25 @@
 """An asset as one HTML file that plays it in any browser, or as a folder for a web server.
 
-Both have the same modules, shaders, styles and data (`player/page/web`, and for the data
-`player.page.scene_files`). The one file contains the modules, joined to one script (`player.page.modules`)
-and compressed by zlib, and the data. Both are stored as text (`player.page.text_bytes`). The file is ASCII
-throughout, so that it reads the same whatever charset a server claims.
+Both have the same `index.html`. It contains the modules of `player/page/web`, joined to one script
+(`player.page.modules`), compressed by zlib and stored as text (`player.page.text_bytes`). The one file also
+contains the poster and the data (`player.page.scene_files`); in the folder these are files beside it. The
+page is ASCII throughout, so that it reads the same whatever charset a server claims.
 
 Files of `player/page/web`:
 
 - `*.js` are ES modules that keep to the rules of `player.page.modules`: `main.js` starts the page,
-  `worker.js` decodes the data, and `boot.js` unpacks the script of the one file and runs it.
+  `worker.js` decodes the data, and `boot.js` unpacks the script of the page and runs it.
 - `*.glsl` are shaders. They are joined to the module `shaders.js`, which is written here: `import { shaders }
   from "./shaders.js";`, then `shaders["march.glsl"]`.
 - `style.css` is the style.
-- `index.html` is the page. In it, `{{title}}` and `{{advice}}`, which says what to do where no script runs,
-  are replaced by text, `{{poster}}` by an address for `src`, and `{{policy}}`, `{{style}}`, `{{data}}` and
-  `{{script}}` by whole elements.
+- `index.html` is the page. In it, `{{title}}` and `{{advice}}`, which says what to do where the data are not
+  beside the page, are replaced by text, `{{poster}}` by an address for `src`, and `{{policy}}`, `{{style}}`,
+  `{{data}}` and `{{script}}` by whole elements.
 
-In the one file, each file of the data is an element `<script type="text/plain" data-file="NAME">`, the
-manifest as it is and the others as text. The compressed script is the element with the id `viewer`. `boot.js`
-unpacks it to an element with the id `script`, whose text the worker runs as well. The scripts come before the
-data, so that they can tell where the data are cut short.
+The compressed script is the element with the id `viewer`. `boot.js` unpacks it to an element with the id
+`script`, whose text the worker runs as well. In the one file, each file of the data is an element
+`<script type="text/plain" data-file="NAME">`, the manifest as it is and the others as text. The scripts come
+before the data, so that they can tell where the data are cut short.
 """
 
 from __future__ import annotations
@@ -47,29 +47,16 @@ INDEX = "index.html"
 STYLE = "style.css"
 BOOT = "boot.js"
 POSTER = "poster.jpg"
-_ADVICE_OF_ONE_FILE = (
-    "Open the page in a current Chrome, Edge, Firefox or Safari with JavaScript switched on."
-)
 _ADVICE_OF_MANY_FILES = (
     "Open this folder through a web server: type python -m http.server in it, then open "
     "http://localhost:8000/. Or export the scene as one file, whose name ends in .html. On a server, the "
-    "folder's address must end in a slash, and files that end in .js must be sent as text/javascript."
+    "folder's address must end in a slash."
 )
-# Inline, because a page on a disk may load no script. It waits for the error event and not for a time, so
-# that a slow line is not taken for a script that cannot run; it comes before the element, to miss no event.
-# The window itself is the event's target where the script arrives, but cannot be parsed, linked or run.
-_WATCH = """\
-addEventListener("error", ({ target }) => {
-  if (target.id !== "script" && (target !== window || window.vfr)) return;
-  document.body.classList.add("failed");
-  document.getElementById("status").textContent = document.querySelector("noscript").textContent;
-}, true);
-"""
 MAX_GPU_MB = 512
 """Megabytes of graphics memory that an exported page may take, unless more are allowed."""
 _POLICY = (
     "default-src 'none'; script-src {script}; style-src {style}; img-src data: blob: {img}; "
-    "worker-src {worker}; connect-src {connect}; base-uri 'none'; form-action 'none'"
+    "worker-src blob:; connect-src {connect}; base-uri 'none'; form-action 'none'"
 )
 
 
@@ -121,28 +108,10 @@ def page_of_one_file(
 ) -> WebPage:
     """Make the same file as `page`; returns it with its sizes."""
     n_gpu = _checked_gpu_bytes(asset, max_gpu_mb)
-    sources = web_files()
-    style, script = _escaped_style(sources[STYLE] + _behind(asset)), page_script(sources)
-    boot, packed = page_script(sources, BOOT, BOOT), zlib.compress(script.encode(), 9)
-    policy = _POLICY.format(
-        script=f"{_hash(boot)} {_hash(script)}",
-        style=_hash(style),
-        img="",
-        worker="blob:",
-        connect="'none'",
-    )
-    viewer = text_of_bytes(packed).decode()
     poster = base64.b64encode(poster_bytes(asset, n_threads, march)).decode()
-    filled = {
-        "policy": _policy_element(policy),
-        "title": _title(asset, title),
-        "style": f"<style>{style}</style>",
-        "poster": f"data:image/jpeg;base64,{poster}",
-        "advice": _ADVICE_OF_ONE_FILE,
-        "script": f'<script type="text/plain" id="viewer" data-bytes="{len(packed)}">{viewer}</script>\n'
-        f'<script type="module">{boot}</script>',
-    }
-    before, behind = (_ascii_html(_filled(half, filled)) for half in sources[INDEX].split("{{data}}"))
+    before, behind = _around_data(
+        asset, title, poster=f"data:image/jpeg;base64,{poster}", advice="", img="", connect="'none'"
+    )
     content = before + data_elements(scene_files(asset)) + behind
     return WebPage({INDEX: content}, len(before) + len(behind) - len(poster), n_gpu)
 
@@ -152,42 +121,48 @@ def page_of_many_files(asset: Asset, title: str | None = None, max_gpu_mb: int |
     first part is loaded. `title`, `max_gpu_mb` and the errors are those of `page`.
 
     >>> files = page_of_many_files(Asset.open("out/")).files
-    >>> {"index.html", "main.js", "part_0.bin"} <= set(files)
+    >>> {"index.html", "poster.jpg", "part_0.bin"} <= set(files)
     True
     """
     n_gpu = _checked_gpu_bytes(asset, max_gpu_mb)
-    sources = {name: text for name, text in web_files().items() if name != BOOT}
-    policy = _POLICY.format(
-        script=f"'self' {_hash(_WATCH)}", style="'self'", img="'self'", worker="'self'", connect="'self'"
+    poster = poster_bytes(asset)
+    # Another poster has another address: a browser may have kept that of an earlier export.
+    address = f"{POSTER}?v={hashlib.sha256(poster).hexdigest()[:8]}"
+    index = b"".join(
+        _around_data(
+            asset, title, poster=address, advice=_ADVICE_OF_MANY_FILES, img="'self'", connect="'self'"
+        )
     )
+    return WebPage({INDEX: index, POSTER: poster, **scene_files(asset)}, len(index), n_gpu)
+
+
+def _around_data(
+    asset: Asset, title: str | None, *, poster: str, advice: str, img: str, connect: str
+) -> tuple[bytes, bytes]:
+    """Return `index.html` as what is before the data and what is behind them."""
+    sources = web_files()
+    style, script = _escaped_style(sources[STYLE] + _behind(asset)), page_script(sources)
+    boot, packed = page_script(sources, BOOT, BOOT), zlib.compress(script.encode(), 9)
+    policy = _POLICY.format(
+        script=f"{_hash(boot)} {_hash(script)}", style=_hash(style), img=img, connect=connect
+    )
+    viewer = text_of_bytes(packed).decode()
     filled = {
         "policy": _policy_element(policy),
-        "title": _title(asset, title),
-        "style": f'<link rel="stylesheet" href="{STYLE}">',
-        "poster": POSTER,
-        "advice": _ADVICE_OF_MANY_FILES,
-        "script": f'<script>{_WATCH}</script>\n<script type="module" id="script" src="main.js"></script>',
-        "data": "",
+        "title": html.escape(asset.folder.resolve().name if title is None else title),
+        "style": f"<style>{style}</style>",
+        "poster": poster,
+        "advice": advice,
+        "script": f'<script type="text/plain" id="viewer" data-bytes="{len(packed)}">{viewer}</script>\n'
+        f'<script type="module">{boot}</script>',
     }
-    sources[INDEX] = _filled(sources[INDEX], filled)
-    sources[STYLE] += _behind(asset)
-    poster = poster_bytes(asset)
-    sources = _with_version(sources, poster)
-    viewer = {name: _ascii_html(text) if name == INDEX else text.encode() for name, text in sources.items()}
-    files = {**viewer, POSTER: poster, **scene_files(asset)}
-    return WebPage(files, sum(map(len, viewer.values())), n_gpu)
-
-
-def _with_version(sources: Mapping[str, str], poster: bytes) -> dict[str, str]:
-    """Return the files of a folder with a version, which depends on all of them, behind the address of each
-    module, the style and the poster: a browser may have kept files of a folder that was exported before."""
-    version = hashlib.sha256("".join(sources.values()).encode() + poster).hexdigest()[:8]
-    address = re.compile(r'"((?:\./)?\w+\.(?:js|css|jpg))"')
-    return {name: address.sub(rf'"\1?v={version}"', text) for name, text in sources.items()}
+    before, behind = (_ascii_html(_filled(half, filled)) for half in sources[INDEX].split("{{data}}"))
+    return before, behind
 
 
 def is_site_file(name: str) -> bool:
-    """Return whether `page_of_many_files` writes a file of that name.
+    """Return whether `page_of_many_files` writes a file of that name, or wrote it when the modules and the
+    style were files of the folder.
 
     >>> is_site_file("main.js"), is_site_file("part_3.bin"), is_site_file("mine.js")
     (True, True, False)
@@ -222,10 +197,6 @@ def _behind(asset: Asset) -> str:
     """Return a CSS rule that shows the scene's background beside the poster."""
     red, green, blue = (round(255 * value) for value in asset.manifest.background)
     return f"#stage {{ background: rgb({red}, {green}, {blue}); }}\n"
-
-
-def _title(asset: Asset, title: str | None) -> str:
-    return html.escape(asset.folder.resolve().name if title is None else title)
 
 
 def web_files() -> dict[str, str]:

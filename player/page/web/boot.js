@@ -1,5 +1,5 @@
-// Starts a page that is one file: unpacks the viewer's script, which the page holds as text, compressed by zlib, and runs
-// it. The page's content security policy names that script by its checksum.
+// Starts a page: unpacks the viewer's script, which the page holds as text, compressed by zlib, and runs it. The page's
+// content security policy names that script by its checksum.
 //
 // Programs find `vfr` at the page's load event, when that script may not have run yet. So `early` takes its place until
 // then, and what programs ask of `early` waits.

@@ -21,7 +21,7 @@
 // onProgress({ done, total }) is told the progress in bytes: half of the total is for loading and half for decoding.
 //
 // If the browser or the device cannot decode a scene, the Error that loadScene throws has `isWhole`: true, which says that
-// the data are not to blame, or is one that `refusesMemory` knows.
+// the data are not to blame, or is one that `refusesMemory` knows. If no scene is found beside the page, it has `isAlone`: true.
 
 import { SceneReader, checkedFile } from "./scene_reader.js";
 
@@ -30,7 +30,9 @@ const GRIDS = ["densities", "features"];
 
 export async function* loadScene(onProgress) {
   const isFile = document.querySelector("script[data-file]") !== null;
-  const manifest = parsed(MANIFEST, await (isFile ? textInPage(MANIFEST) : fetched(MANIFEST)), isFile);
+  const manifest = await manifestOf(isFile).catch((error) => {
+    throw Object.assign(error, { isAlone: !isFile });
+  });
   const nParts = manifest.parts.length;
   const total = manifest.parts.reduce((sum, part) => sum + manifest.files[part.file].bytes, 0);
   const done = { there: isFile ? total : 0, decoded: 0 };
@@ -99,7 +101,7 @@ function textInPage(name) {
 // Fetch a file beside the page, as bytes; `onBytes` is called with the number of bytes each time some arrive. The browser
 // asks the server whether a copy that it has kept is still the file: the scene may have been exported again.
 async function fetched(name, entry, onBytes = () => {}, signal) {
-  const response = await fetch(name, { cache: "no-cache", signal });
+  const response = await fetch(name, { cache: "no-cache", signal }).catch(() => ({ status: "no answer" }));
   if (!response.ok) throw new Error(`${name}: expected it beside the page, got ${response.status}`);
   const most = entry?.bytes ?? 1 << 24;
   const data = new Uint8Array(most);
@@ -115,11 +117,12 @@ async function fetched(name, entry, onBytes = () => {}, signal) {
   }
 }
 
-function parsed(name, content, isFile) {
+async function manifestOf(isFile) {
+  const text = isFile ? textInPage(MANIFEST) : new TextDecoder().decode(await fetched(MANIFEST));
   try {
-    return JSON.parse(isFile ? content : new TextDecoder().decode(content));
+    return JSON.parse(text);
   } catch {
-    throw new Error(`${name}: expected JSON: the page was cut short or changed`);
+    throw new Error(`${MANIFEST}: expected JSON: the page was cut short or changed`);
   }
 }
 
@@ -183,9 +186,9 @@ class SceneError extends Error {}
 // A SceneReader in a worker.
 class WorkerReader {
   constructor(manifest, grids) {
-    const own = document.getElementById("script").textContent; // empty unless the page is one file
-    const address = own && URL.createObjectURL(new Blob([own], { type: "text/javascript" }));
-    this.worker = own ? new Worker(address) : new Worker("worker.js", { type: "module" });
+    const script = document.getElementById("script").textContent; // the page's own, which begins with worker.js there
+    const address = URL.createObjectURL(new Blob([script], { type: "text/javascript" }));
+    this.worker = new Worker(address);
     this.waiting = new Map();
     this.asked = 0;
     this.isWhole = true;

@@ -57,6 +57,7 @@ async function show() {
     }
   } catch (error) {
     if (error.isWhole || refusesMemory(error)) advice = INSTEAD;
+    if (error.isAlone) advice = document.getElementById("stage").dataset.advice || ANEW;
     if (viewer) problem = `This scene cannot be shown whole here: ${error.message}. ${advice}`;
     else panel.fail(`This scene cannot be shown here: ${error.message}. ${advice}`);
     throw error;

@@ -6,26 +6,26 @@ import base64
 import hashlib
 import os
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from threading import Thread
 from typing import NamedTuple
+from unittest.mock import patch
 
 import numpy as np
 import pytest
 from playwright.sync_api import Browser, Page, Route
 
 from exporters.export import export_asset
-from exporters.options import ExportOptions
 from player.asset.asset import Asset
 from player.errors import ConfigError, FormatError
 from player.page import page
-from player.page.gpu_memory import MOST_CHANNELS, decoding_bytes, feature_bytes
+from player.page.gpu_memory import MOST_CHANNELS
 from player.page.modules import joined
-from player.page.page import page_of_many_files, page_of_one_file, page_script, web_files
+from player.page.page import WebPage, page_of_many_files, page_of_one_file, page_script, web_files
 from player.page.scene_files import scene_files
 from player.page.text_bytes import ALPHABET, bytes_of_text, text_of_bytes
 from tests.player.page import scenes
@@ -138,16 +138,17 @@ def test_the_package_has_every_module_that_is_imported() -> None:
 # --- the page ---
 
 
-def test_a_page_is_plain_and_names_what_runs(asset: Asset, shells_folder: Path) -> None:
-    made = page_of_one_file(asset, title='</title><script>alert("x")</script>')
-    (html,) = made.files.values()
-    text = html.decode("ascii")
+@pytest.mark.parametrize(("make", "beside"), [(page_of_one_file, "'none'"), (page_of_many_files, "'self'")])
+def test_a_page_is_plain_and_names_what_runs(asset: Asset, make: Callable[..., WebPage], beside: str) -> None:
+    made = make(asset, title='</title><script>alert("x")</script>')
+    text = made.files["index.html"].decode("ascii")
     before, _, behind = text.partition("</title>")
     assert before.endswith("<title>&lt;/title&gt;&lt;script&gt;alert(&quot;x&quot;)&lt;/script&gt;")
     assert "alert(" not in behind
     (policy,) = re.findall(r'Content-Security-Policy" content="([^"]*)"', text)
     rules = dict(rule.strip().partition(" ")[::2] for rule in policy.split(";"))
-    assert rules["default-src"] == rules["connect-src"] == "'none'" and "unsafe" not in policy
+    assert rules["default-src"] == "'none'" and rules["connect-src"] == beside and "unsafe" not in policy
+    assert rules["worker-src"] == "blob:" and ("'self'" in rules["img-src"]) == (beside == "'self'")
     named = set(rules["script-src"].split()) | set(rules["style-src"].split())
     scripts = re.findall(r'<script type="module">(.*?)</script>', text, re.DOTALL)
     styles = re.findall(r"<style>(.*?)</style>", text, re.DOTALL)
@@ -155,10 +156,20 @@ def test_a_page_is_plain_and_names_what_runs(asset: Asset, shells_folder: Path) 
     digests = [hashlib.sha256(some.encode()).digest() for some in (*scripts, *styles, whole)]
     assert named == {f"'sha256-{base64.b64encode(digest).decode()}'" for digest in digests}
     assert len(scripts) == len(styles) == 1
+    if make is page_of_many_files:
+        text, n = re.subn(r'data-advice="[^"]+"|src="poster\.jpg\?v=\w+"', "", text)
+        assert n == 2
     assert not re.search(r"""(src|href)=["'](?!data:)|https?://|@import|url\(|\son\w+=|\sstyle=""", text)
-    assert made.viewer_bytes < MOST_VIEWER
     data = sum(map(len, scene_files(asset).values()))
-    assert len(html) < 1.35 * (data + made.viewer_bytes + 50_000)
+    assert sum(map(len, made.files.values())) < 1.35 * (data + made.viewer_bytes + 50_000)
+
+
+def test_the_viewer_is_small(asset: Asset) -> None:
+    one, many = page_of_one_file(asset), page_of_many_files(asset)
+    others = {name: data for name, data in many.files.items() if name not in scene_files(asset)}
+    del others["poster.jpg"]
+    assert sum(map(len, others.values())) == many.viewer_bytes <= MOST_VIEWER
+    assert one.viewer_bytes <= MOST_VIEWER
 
 
 def test_a_title_may_hold_what_the_page_fills_in(asset: Asset) -> None:
@@ -176,34 +187,6 @@ def test_the_data_is_what_the_asset_has(asset: Asset, tmp_path: Path) -> None:
     facts = export_asset(asset.folder, tmp_path / "scene.html")
     assert facts["bytes"] == (tmp_path / "scene.html").stat().st_size
     assert (tmp_path / "scene.html").read_bytes() == page(Asset.open(asset.folder))
-
-
-@pytest.mark.parametrize(("n_channels", "most"), [(4, 2**24), (32, 2**24), (33, 2**23), (40, 2**23)])
-def test_rows_that_no_texture_holds_are_refused(n_channels: int, most: int) -> None:
-    """More rows of features are refused than a shader can tell apart (2^24), or than fit into the 256 layers
-    of 256 lines that WebGL 2 guarantees."""
-    assert feature_bytes(most, n_channels) >= most * n_channels
-    with pytest.raises(FormatError, match=f"expected at most {most} rows of features, got {most + 1}"):
-        feature_bytes(most + 1, n_channels)
-
-
-def test_more_graphics_memory_than_may_be_is_refused(asset: Asset, tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"expected at most 1 MB, got \d+ MB: bake it smaller"):
-        export_asset(asset.folder, tmp_path / "scene.html", ExportOptions(max_gpu_mb=1))
-    assert not list(tmp_path.iterdir())
-
-
-def test_more_memory_than_browsers_give_a_page_is_refused(
-    asset: Asset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    limits = page_of_one_file.__globals__
-    monkeypatch.setitem(limits, "MOST_DECODING_BYTES", decoding_bytes(asset))
-    for name in ("scene.html", "site"):
-        export_asset(asset.folder, tmp_path / name, ExportOptions(format=None if "." in name else "web"))
-    monkeypatch.setitem(limits, "MOST_DECODING_BYTES", decoding_bytes(asset) - 1)
-    for make in (page_of_one_file, page_of_many_files):
-        with pytest.raises(ConfigError, match=r"memory to unpack the scene: expected at most \d+ MB, which"):
-            make(asset)
 
 
 def test_more_channels_than_browsers_draw_are_refused(chromium: Browser, tmp_path: Path) -> None:
@@ -281,11 +264,13 @@ def test_a_page_plays_from_a_disk(chromium: Browser, asset: Asset, tmp_path: Pat
 SITE = "http://localhost/scene/"
 
 
-def site(asset: Asset, before_worker: bytes = b"") -> dict[str, tuple[bytes, str]]:
-    """Return what a server at SITE answers; the worker begins with `before_worker`."""
-    kinds = {".js": "text/javascript", ".html": "text/html", ".css": "text/css", ".jpg": "image/jpeg"}
-    files = page_of_many_files(asset).files
-    files["worker.js"] = before_worker + files["worker.js"]
+def site(asset: Asset, module: str = "main.js", before: str = "") -> dict[str, tuple[bytes, str]]:
+    """Return what a server at SITE answers; `module` begins with the lines `before`."""
+    kinds = {".html": "text/html", ".jpg": "image/jpeg"}
+    sources = web_files()
+    sources[module] = before + sources[module]
+    with patch.dict(page_of_many_files.__globals__, web_files=lambda: sources):
+        files = page_of_many_files(asset).files
     answers = {
         SITE + name: (data, kinds.get(Path(name).suffix, "application/octet-stream"))
         for name, data in files.items()
@@ -297,9 +282,8 @@ def test_a_site_plays_from_a_server(chromium: Browser, asset: Asset) -> None:
     answers = site(asset)
     with opened(chromium, SITE, answers) as found:
         check_plays(found)
-        asked = {url.partition("?")[0] for url in found.asked}
-        assert asked <= set(answers)
-        assert {SITE + name for name in ("poster.jpg", "worker.js", "part_0.bin")} <= asked
+        asked = {url.partition("?")[0] for url in found.asked if not url.startswith("blob:")}
+        assert asked == set(answers) - {SITE + "index.html"}
 
 
 class Server(SimpleHTTPRequestHandler):
@@ -343,41 +327,62 @@ def test_a_site_that_is_exported_again_shows_the_new_scene(
         found.page.reload()
         assert found.page.evaluate(n_channels) == 5
         assert found.page.title() == "new"
+        assert len({url for url in found.asked if url.startswith(address + "poster.jpg")}) == 2
 
 
-@pytest.mark.parametrize("kind", ["one file", "a folder on a disk", "a folder of plain text"])
-def test_a_page_whose_script_does_not_run_says_what_to_do(
-    chromium: Browser, asset: Asset, tmp_path: Path, kind: str
+@pytest.mark.parametrize("make", [page_of_one_file, page_of_many_files])
+def test_a_page_without_javascript_says_what_to_do(
+    chromium: Browser, asset: Asset, tmp_path: Path, make: Callable[[Asset], WebPage]
 ) -> None:
-    files = {"index.html": page(asset)} if kind == "one file" else page_of_many_files(asset).files
-    for name, data in files.items():
+    for name, data in make(asset).files.items():
         (tmp_path / name).write_bytes(data)
-    with chromium.new_context(java_script_enabled=kind != "one file") as context:
+    with chromium.new_context(java_script_enabled=False) as context:
         found = context.new_page()
         found.set_default_timeout(SECONDS * 1000)
-        if kind == "a folder of plain text":
-            plain = {
-                url: (data, type_.replace("/javascript", "/plain"))
-                for url, (data, type_) in site(asset).items()
-            }
-            context.route("**/*", lambda route: answer(route, plain))
-            found.goto(SITE)
-        else:
-            found.goto((tmp_path / "index.html").as_uri())
+        found.goto((tmp_path / "index.html").as_uri())
         wait_for(found, lambda: "script cannot run here. Open " in found.inner_text("#status"))
-        said = found.inner_text("#status")
-    assert ("python -m http.server" in said) == (kind != "one file") == ("scene as one file" in said)
+        assert "with JavaScript switched on" in found.inner_text("#status")
 
 
-@pytest.mark.parametrize(
-    "before", [b"(", b'import { none } from "./pose.js";', b"throw 1;"], ids=["parse", "link", "run"]
-)
-def test_a_site_whose_script_fails_says_what_to_do(chromium: Browser, asset: Asset, before: bytes) -> None:
+@pytest.mark.parametrize("where", ["on a disk", "without its slash", "where another page answers"])
+def test_a_folder_whose_scene_is_not_found_says_what_to_do(
+    chromium: Browser, asset: Asset, tmp_path: Path, where: str
+) -> None:
+    address, answers = SITE, site(asset)
+    if where == "on a disk":
+        for name, data in page_of_many_files(asset).files.items():
+            (tmp_path / name).write_bytes(data)
+        address, answers = (tmp_path / "index.html").as_uri(), None
+    elif where == "without its slash":
+        address = SITE.removesuffix("/")
+        answers[address] = answers[SITE]
+    else:
+        answers[SITE + "manifest.json"] = answers[SITE]
+    with opened(chromium, address, answers) as found:
+        found.page.wait_for_selector("body.failed")
+        said = found.page.inner_text("#status")
+        told = found.page.evaluate("() => vfr.ready.then(() => null, (error) => error.message)")
+    assert told.startswith("manifest.json: expected ") and told in said
+    for advice in ("python -m http.server", "scene as one file", "must end in a slash"):
+        assert advice in said
+
+
+def test_a_folder_that_lacks_another_file_is_not_said_to_lack_a_server(
+    chromium: Browser, asset: Asset
+) -> None:
     answers = site(asset)
-    body, type_ = answers[SITE + "loader.js"]
-    answers[SITE + "loader.js"] = (before + body, type_)
+    del answers[SITE + "cameras.json"]
     with opened(chromium, SITE, answers) as found:
-        wait_for(found.page, lambda: "script cannot run here. Open " in found.page.inner_text("#status"))
+        found.page.wait_for_selector("body.failed")
+        said = found.page.inner_text("#status")
+    assert "cameras.json: expected it beside the page, got no answer" in said
+    assert "load the page again" in said and "http.server" not in said
+
+
+@pytest.mark.parametrize("before", ["(\n", "throw 1;\n"], ids=["parse", "run"])
+def test_a_site_whose_script_fails_says_what_to_do(chromium: Browser, asset: Asset, before: str) -> None:
+    with opened(chromium, SITE, site(asset, "loader.js", before)) as found:
+        check_advises_another_device(found)
 
 
 @pytest.mark.parametrize("kind", ["one file", "a folder"])
@@ -412,7 +417,7 @@ def check_advises_another_device(found: Opened) -> str:
 
 
 def test_a_site_in_a_browser_that_cannot_decode_it_names_others(chromium: Browser, asset: Asset) -> None:
-    answers = site(asset, b"delete self.DecompressionStream;\n")
+    answers = site(asset, "worker.js", "delete self.DecompressionStream;\n")
     with opened(chromium, SITE, answers) as found:
         said = check_advises_another_device(found)
         assert "expected a browser with DecompressionStream, got an older one" in said
@@ -429,13 +434,10 @@ def test_a_scene_that_takes_too_much_memory_to_decode_asks_for_another_device(
 
 def failing_site(asset: Asset, where: str, message: str) -> dict[str, tuple[bytes, str]]:
     """Return `site` with a RangeError for each DataView of the worker, or of a page that has no worker."""
-    answers = site(asset)
     begin = f"DataView = class {{ constructor() {{ throw RangeError('{message}'); }} }};\n"
     if where == "loader.js":
         begin += "globalThis.Worker = undefined;\n"
-    body, type_ = answers[SITE + where]
-    answers[SITE + where] = (begin.encode() + body, type_)
-    return answers
+    return site(asset, where, begin)
 
 
 @pytest.mark.parametrize("where", ["worker.js", "loader.js"])

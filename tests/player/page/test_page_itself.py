@@ -16,13 +16,16 @@ from PIL import Image
 from playwright.sync_api import Browser, Page
 
 from exporters.export import export_asset
+from exporters.options import ExportOptions
 from player.asset.asset import Asset
 from player.cameras.camera import Camera
 from player.cameras.views import asset_cameras
-from player.errors import ConfigError
+from player.errors import ConfigError, FormatError
 from player.files.images import to_8_bit
+from player.page.gpu_memory import decoding_bytes, feature_bytes
 from player.page.notebook import inline
 from player.page.page import page as page_of
+from player.page.page import page_of_many_files, page_of_one_file
 from player.page.rest import rest_camera
 from player.render import Renderer
 from player.viewer.server import ServeSettings, serve
@@ -189,6 +192,34 @@ def test_a_notebook_shows_it_below_a_cell(chromium: Browser, asset: Asset, tmp_p
     assert not card.is_visible()
     context.close()
     assert not said
+
+
+@pytest.mark.parametrize(("n_channels", "most"), [(4, 2**24), (32, 2**24), (33, 2**23), (40, 2**23)])
+def test_rows_that_no_texture_holds_are_refused(n_channels: int, most: int) -> None:
+    """More rows of features are refused than a shader can tell apart (2^24), or than fit into the 256 layers
+    of 256 lines that WebGL 2 guarantees."""
+    assert feature_bytes(most, n_channels) >= most * n_channels
+    with pytest.raises(FormatError, match=f"expected at most {most} rows of features, got {most + 1}"):
+        feature_bytes(most + 1, n_channels)
+
+
+def test_more_graphics_memory_than_may_be_is_refused(asset: Asset, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"expected at most 1 MB, got \d+ MB: bake it smaller"):
+        export_asset(asset.folder, tmp_path / "scene.html", ExportOptions(max_gpu_mb=1))
+    assert not list(tmp_path.iterdir())
+
+
+def test_more_memory_than_browsers_give_a_page_is_refused(
+    asset: Asset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    limits = page_of_one_file.__globals__
+    monkeypatch.setitem(limits, "MOST_DECODING_BYTES", decoding_bytes(asset))
+    for name in ("scene.html", "site"):
+        export_asset(asset.folder, tmp_path / name, ExportOptions(format=None if "." in name else "web"))
+    monkeypatch.setitem(limits, "MOST_DECODING_BYTES", decoding_bytes(asset) - 1)
+    for make in (page_of_one_file, page_of_many_files):
+        with pytest.raises(ConfigError, match=r"memory to unpack the scene: expected at most \d+ MB, which"):
+            make(asset)
 
 
 def test_no_page_but_an_exported_one_is_refused_for_its_graphics_memory(
