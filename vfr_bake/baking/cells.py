@@ -58,6 +58,8 @@ CONTRACTED_RAYS_AT_ONCE = 1 << 14
 WEIGHT_FLOOR = 0.01
 """Default weight that a cell of an unbounded scene must have on some ray. Fox at 1088 cells loses nothing by
 it; with 0.003 it would have half again as many vertices."""
+FOG_FLOOR = 1e-6
+"""Default weight where no cell reaches WEIGHT_FLOOR, as in a thin even fog: low enough for all of the fog."""
 CELL_SHARE = 0.008
 """Share of the cells of contracted space that is expected to be stored, before a scene is examined."""
 
@@ -138,6 +140,11 @@ def find_cells(
     if model.field.config.unbounded:
         floor = config.weight_floor or WEIGHT_FLOOR
         visible = weighty_cells(model, resolutions.features, floor, progress)
+        if config.weight_floor is None and not visible.any():
+            floor = FOG_FLOOR
+            visible = weighty_cells(model, resolutions.features, floor, progress)
+        if not visible.any():
+            raise _nothing_seen(floor)
         left_out = (
             f"{1 - visible.mean():.1%} of contracted space: no view gives a cell there a weight of "
             f"{floor:g}; part of the loss after 'grid'"
@@ -208,7 +215,7 @@ def cull(
 
 def _nothing_seen(floor: float) -> TrainingError:
     return TrainingError(
-        f"no cell weighs {floor} in any training view: the model is empty or a thin fog: "
+        f"no cell weighs {floor:g} in any training view: the model is empty or a thin fog: "
         "train longer, or lower --weight-floor"
     )
 
@@ -373,8 +380,7 @@ def weighty_cells(model: Model, resolution: int, weight_floor: float, progress: 
     Views are the training cameras and BETWEEN times as many between them. `resolution` is a multiple of
     BLOCK. There are as many rays as it takes for a block at the unit sphere to be met CONTRACTED_HITS times
     over all views, but at most MOST_SEEING. Pictures are widened a little, because another camera of the
-    scene will see beyond their border, where the model has content, too. Raises TrainingError if nothing is
-    seen.
+    scene will see beyond their border, where the model has content, too.
     """
     n_blocks = resolution // BLOCK
     visible = np.zeros((n_blocks,) * 3, np.uint8)
@@ -390,8 +396,6 @@ def weighty_cells(model: Model, resolution: int, weight_floor: float, progress: 
             rows = slice(first, first + CONTRACTED_RAYS_AT_ONCE)
             _mark(model, rays_o[rows], rays_d[rows], weight_floor, visible)
         progress(index + 1, len(cameras))
-    if not visible.any():
-        raise _nothing_seen(weight_floor)
     return close_gaps(visible.view(bool))
 
 

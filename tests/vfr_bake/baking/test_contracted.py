@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import deepcopy
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from exporters.export import export_asset
 from player.asset.asset import Asset
 from player.cameras.camera import Camera
 from player.compiled import march as march_compiled
+from player.errors import TrainingError
 from player.march.contracted import enter_space
 from player.progress import silent
 from player.render import render
@@ -117,6 +119,26 @@ def test_what_no_sample_weighs_in_is_not_stored(model: Model) -> None:
     camera = model.model_cameras()[0].c2w[:3, 3]
     x, y, z = ((contract(camera) + 2) * 8).astype(int)  # of the 32 blocks in 4 units
     assert not cells[x, y, z], "a camera stands in empty space"
+
+
+def test_a_fog_in_which_no_cell_weighs_much_is_stored(
+    model: Model, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A fog is stored although no cell of it reaches the usual weight floor; if that floor was asked for, it
+    is refused. The floor is higher here than usual, because a fog that stays below 0.01 is hardly seen."""
+    monkeypatch.setattr("vfr_bake.baking.cells.WEIGHT_FLOOR", 0.3)
+    field = deepcopy(model.field)
+    with torch.no_grad():
+        field.density.out.weight.fill_(0)
+        field.density.out.bias.fill_(-2)
+    thin = replace(model, field=field, witnesses=None, training_pixels=None)
+    settings = replace(SETTINGS, weight_floor=None, refine_steps=0)
+    bake(thin, tmp_path / "asset", settings, silent)
+    opacity = render(Asset.open(tmp_path / "asset"), model.cameras[0]).opacity
+    _, wanted = thin.sampler.composited_features(field, *thin.model_cameras()[0].rays())
+    assert 0.5 * wanted.mean() < opacity.mean() < 1.5 * wanted.mean()
+    with pytest.raises(TrainingError, match=r"no cell weighs 0\.3 in any training view"):
+        bake(thin, tmp_path / "other", replace(settings, weight_floor=0.3), silent)
 
 
 def test_many_views_take_no_more_rays_than_there_is_time_for(
