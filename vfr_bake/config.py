@@ -44,15 +44,10 @@ the paper's head would take about half of a step's time, and a head of half its 
 many steps (docs/notes/2026-11-25-width-of-the-head.md)."""
 
 
-def object_table_size(n_pixels: int) -> int:
-    """Return log2 of the entries of an object's larger tables on a CPU: about a quarter of the pixels that
-    are trained on, because the more they say, the more places must not share an entry
-    (docs/notes/2026-11-30-tables-and-directions.md).
-
-    >>> object_table_size(64 * 256**2), object_table_size(100 * 400**2), object_table_size(10**9)
-    (20, 22, 22)
-    """
-    return min(max(20, round(math.log2(max(n_pixels, 1) / 4))), 22)
+BEST_OBJECT_FIELD = {"log2_table_size": 22, "sh_degree": 7}
+"""Architecture settings of an object that is trained with the effort `best` on a CPU. Within ten minutes its
+model would gain a third of a decibel, too, but bakes of it lose more
+(docs/notes/2026-11-30-tables-and-directions.md)."""
 
 
 def check(settings: object, name: str, fits: bool, expected: str) -> None:
@@ -140,8 +135,8 @@ class FieldOptions:
     """Cells per axis of the finest level; objects 512 (over the box), unbounded scenes 2048 (contracted)."""
     log2_table_size: int | None = None
     """A level with more vertices than two to this power shares entries by hashing. CPU: 20, because places
-    that share an entry disturb each other in views that are not learned from; up to 22 for an object whose
-    pictures have more than 6 million pixels in all. GPU: 19, as in the paper."""
+    that share an entry disturb each other in views that are not learned from; 22 for an object with --effort
+    best. GPU: 19, as in the paper."""
     density_width: int | None = None
     """Hidden width of the density network, 0 for a linear map; objects 64, unbounded scenes 0 (paper)."""
     compositing: Compositing = "features"
@@ -156,18 +151,17 @@ class FieldOptions:
     view_encoding: ViewEncoding = "sh-features"
     """Spherical harmonics times features that the head predicts (the paper's equation 4), or alone."""
     sh_degree: int | None = None
-    """Bands of spherical harmonics: degree 4 means l = 0..3, 16 functions; objects 4, unbounded scenes 7."""
+    """Bands of spherical harmonics: degree 4 means l = 0..3, 16 functions; objects 4, or 7 with --effort best
+    on a CPU; unbounded scenes 7."""
     n_sh_features: int | None = None
     """Features that multiply each basis function; objects 4, unbounded scenes 8, as in the paper."""
 
-    def resolved(self, unbounded: bool, device: str = "cpu", n_pixels: int = 0) -> FieldConfig:
-        """Return the architecture with every open setting filled in. `n_pixels`: those of all pictures that
-        are trained on. Raises ConfigError for values out of range."""
-        chosen = FIELD_BY_DEVICE[device]
-        if unbounded:
-            chosen = UNBOUNDED_FIELD | chosen
-        elif device == "cpu":
-            chosen = chosen | {"log2_table_size": object_table_size(n_pixels)}
+    def resolved(self, unbounded: bool, device: str = "cpu", effort: Effort = "good") -> FieldConfig:
+        """Return the architecture with every open setting filled in. Raises ConfigError for values out of
+        range."""
+        chosen = (UNBOUNDED_FIELD if unbounded else {}) | FIELD_BY_DEVICE[device]
+        if effort == "best" and device == "cpu" and not unbounded:
+            chosen |= BEST_OBJECT_FIELD
         given = {name: value for name, value in asdict(self).items() if value is not None}
         return FieldConfig(**(chosen | given))
 
@@ -236,8 +230,9 @@ class TrainConfig:
     then in the unit of that distance, metres for glTF and USD, in every export. Pictures alone do not tell
     how large anything is."""
     effort: Effort = "good"
-    """How long a training may take on a CPU: draft 2 minutes, good 10 (unbounded scenes 12), best 60. It ends
-    earlier when the error on pixels not learned from is flat. A GPU takes its steps, a draft 2 minutes."""
+    """How long a training may take on a CPU: draft 2 minutes, good 10 (unbounded scenes 12), best 60, for
+    which an object gets larger tables and a finer view encoding. It ends earlier when the error on pixels not
+    learned from is flat. A GPU takes its steps, a draft 2 minutes."""
     steps: int | None = None
     """Optimiser steps: so many are taken if the minutes allow it. CPU: as many as they allow; GPU: 20,000
     (unbounded scenes 40,000) with far larger batches, as in the paper."""

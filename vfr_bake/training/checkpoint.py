@@ -24,7 +24,7 @@ FORMAT = "vfr-checkpoint"
 VERSION = [1, 7]
 READABLE = ([1, 6], VERSION)
 """Versions that are read."""
-LENGTH_SETTINGS = {"effort", "steps", "minutes", "eval_views", "checkpoint_minutes"}
+LENGTH_SETTINGS = {"steps", "minutes", "eval_views", "checkpoint_minutes"}
 """Settings that may differ between the run that was interrupted and the one that continues it."""
 NO_LIMIT = 1e8
 """Gigabytes of memory that reading may take: training has held all of it, and goes on with it."""

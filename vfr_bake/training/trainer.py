@@ -112,8 +112,7 @@ class Trainer:
         if self._backend == "torch" and self.processes.size > 1:
             advice = "pass --device cpu, or start one process"
             raise ConfigError(f"device: several processes: expected cpu, got {self.device.type}: {advice}")
-        n_pixels = sum(camera.width * camera.height for camera in scene.train.cameras)
-        settings = config.field.resolved(scene.unbounded, self.device.type, n_pixels)
+        settings = config.field.resolved(scene.unbounded, self.device.type, config.effort)
         self._field = VfrField(settings).to(self.device)
         self._field.grid.backend = self._backend
         self.pilot = Pilot(self._field.config).to(self.device)

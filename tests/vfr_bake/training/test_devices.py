@@ -189,8 +189,10 @@ def test_what_is_not_given_follows_from_the_device() -> None:
     assert (on_gpu.log2_table_size, on_gpu.head_width) == (19, 256)
     assert FieldOptions(log2_table_size=15).resolved(False, "cuda").log2_table_size == 15
     assert FieldOptions().resolved(False) == FieldOptions().resolved(False, "cpu")
-    tables = [FieldOptions().resolved(unbounded, "cpu", 10**8).log2_table_size for unbounded in (False, True)]
-    assert tables == [22, 20]
+    best = FieldOptions().resolved(False, "cpu", "best")
+    assert (best.log2_table_size, best.sh_degree) == (22, 7)
+    assert FieldOptions().resolved(True, "cpu", "best") == FieldOptions().resolved(True, "cpu")
+    assert FieldOptions().resolved(False, "cuda", "best") == on_gpu
     for name, value in {"steps": 0, "batch_samples": 3, "network_rate": 1.0, "device": "tpu"}.items():
         with pytest.raises(ConfigError, match=f"{name}: expected"):
             TrainConfig(**{name: value})  # type: ignore[arg-type]
