@@ -32,6 +32,7 @@ from exporters.shapes.volume import asset_volume
 from exporters.surface.asset_surface import AssetSurface
 from exporters.surface.inner_region import inner_region
 from player.asset.asset import Asset
+from player.asset.target import asset_files
 from player.cameras.camera import Camera
 from player.cameras.transforms import frame_names
 from player.cameras.views import asset_cameras, read_views
@@ -225,7 +226,8 @@ def _check_target(asset_path: Path, target: Path, name: str, force: bool) -> boo
     elif target.exists() and target.is_dir() != is_folder:
         wanted, there = ("folder", "file") if is_folder else ("file", "folder")
         raise OutputError(f"{target}: expected the name of a {wanted}, got a {there}")
-    if asset_path.resolve() in (target.resolve(), *target.resolve().parents):
-        raise OutputError(f"{target}: expected a place outside the asset {asset_path}, got one inside")
+    own = {asset_path.resolve() / file for file in ("", *(asset_files(asset_path) or ()))}
+    if target.resolve() in own:
+        raise OutputError(f"{target}: is part of the asset: name another {'folder' if is_folder else 'file'}")
     check_target(target, force)
     return force

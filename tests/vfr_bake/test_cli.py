@@ -79,16 +79,16 @@ def test_the_help_names_the_defaults_that_hold(
     draft, good, best = EFFORT_MINUTES.values()
     assert cpu.grid_rate == gpu.grid_rate
     for text in (
-        f"Objects {EVAL_VIEWS[False]}, scenes {EVAL_VIEWS[True]}, a view of which",
-        f"GPU: {gpu.steps:,} (scenes {scenes.steps:,})",
-        f"draft {draft[0]:g} minutes, good {good[0]:g} (scenes {good[1]:g}), best {best[0]:g}.",
+        f"Objects {EVAL_VIEWS[False]}, unbounded scenes {EVAL_VIEWS[True]}, a view of which",
+        f"GPU: {gpu.steps:,} (unbounded scenes {scenes.steps:,})",
+        f"draft {draft[0]:g} minutes, good {good[0]:g} (unbounded scenes {good[1]:g}), best {best[0]:g},",
         f"GPU {gpu.batch_samples:,}, CPU {cpu.batch_samples:,},",
         f"GPU {gpu.batch_rays:,}, CPU {cpu.batch_rays:,},",
         f"GPU {gpu.max_rays:,}, CPU {cpu.max_rays:,}.",
         f"GPU {gpu.network_rate:g}, as in the paper, CPU {cpu.network_rate:g}.",
         f"Adam learning rate of the hash grids; {cpu.grid_rate:g}.",
         f"paper); {cpu.pilot_steps}, but no more than a quarter of the training.",
-        f"objects {cpu.distortion:g}, within a hundredth of the box; scenes {scenes.distortion:g},",
+        f"objects {cpu.distortion:g}, within a hundredth of the box; unbounded scenes {scenes.distortion:g},",
         f"Seed of every random number. (default: {TrainConfig().seed})",
     ):
         assert text.replace(" ", "") in said, text

@@ -15,6 +15,7 @@ from tests.player.test_proof import DIES, WRONG, child_runs, lines, nothing_know
 from vfr_bake.baking import bake, plan
 from vfr_bake.baking.held_out import HeldOut
 from vfr_bake.commands.bake import bake_command
+from vfr_bake.config import BakeConfig, FieldConfig
 from vfr_bake.training import model_file
 
 __all__ = ["nothing_known"]
@@ -25,7 +26,8 @@ def test_a_bake_asks_before_it_begins(
 ) -> None:
     made = SimpleNamespace(n_bytes=1, resolutions=(1, 1), n_cells=1, n_rays=lambda n: n)
     child_runs(monkeypatch, DIES)
-    monkeypatch.setattr(model_file, "load_model", lambda *_: None)
+    model = SimpleNamespace(field=SimpleNamespace(config=FieldConfig()))
+    monkeypatch.setattr(model_file, "load_model", lambda *_: model)
     monkeypatch.setattr(bake, "check_bakeable", lambda *_: None)
     monkeypatch.setattr(plan, "make_plan", lambda *_: made)
     monkeypatch.setattr(plan, "expected_seconds", lambda *_: 1.0)
@@ -33,7 +35,7 @@ def test_a_bake_asks_before_it_begins(
     options = SimpleNamespace(
         asset=tmp_path / "asset",
         model=None,
-        config=SimpleNamespace(max_memory=None, memory=4.0),
+        config=BakeConfig(),
         force=False,
         json=None,
         convert=None,

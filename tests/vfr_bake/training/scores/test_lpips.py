@@ -119,7 +119,7 @@ def test_missing_weights_say_which_file_goes_where(home: Path, network: str) -> 
 @pytest.mark.usefixtures("home")
 def test_missing_package_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("vfr_bake.training.scores.lpips.find_spec", lambda name: None)
-    with pytest.raises(MissingExtraError, match=r"pip install vfr-bake\[lpips\]"):
+    with pytest.raises(MissingExtraError, match=r"pip install 'vfr-bake\[lpips\]'"):
         Lpips()
 
 
