@@ -148,16 +148,17 @@ class _Bake:
             self.held_out = HeldOut(model, config.check_views)
 
     def run(self, folder: Path, force: bool) -> BakeResult:
-        layout, n_rays = self._cells()
-        stored, teacher, again = self._store(layout, n_rays)
+        layout, n_cells = self._cells()
+        stored, teacher, again = self._store(layout, self.plan.n_rays(n_cells))
         while not self._is_in_time(stored, layout):
             del layout, stored, teacher, again  # free memory for the coarser ones
             self.plan = self.plan.coarser()
             self.held_out.stages.clear()
-            layout, n_rays = self._cells()
-            stored, teacher, again = self._store(layout, n_rays)
+            layout, n_cells = self._cells()
+            stored, teacher, again = self._store(layout, self.plan.n_rays(n_cells))
         left = refinement_seconds(self.choice, time.monotonic() - self._begun)
-        tuning = Tuning(self.config, self.choice, self.held_out, self._report, left)
+        most_kept = self.plan.kept_bytes(n_cells)
+        tuning = Tuning(self.config, self.choice, self.held_out, self._report, left, most_kept)
         with self._part("refinement"):
             stored = tuning.run(stored, layout, teacher, again)
         self.n_fetches, self.lookups = tuning.n_fetches, tuning.lookups
@@ -213,8 +214,7 @@ class _Bake:
         return BakeResult(figures["n_vertices"], n_bytes, seconds, last.loss, figures, made[0].missed)
 
     def _cells(self) -> tuple[Layout, int]:
-        """Return the layout of the stored densities and features, and the number of training rays for which
-        it leaves memory."""
+        """Return the layout of the stored densities and features, and the number of the features' cells."""
         model, plan = self.model, self.plan
         with self._part("visibility"):
             progress = partial(self._report, "visibility")
@@ -240,7 +240,7 @@ class _Bake:
             step = lattice_step(resolutions.densities) if unbounded else step * plan.longer
         near = 0.0 if isinstance(model.sampler, OccupancyGrid) else model.sampler.near
         layout = make_layout(fitted.cells, step, resolutions, unbounded, near, self.choice.density_step)
-        return layout, plan.n_rays(fitted.n_cells)
+        return layout, fitted.n_cells
 
     def _room_for_cells(self) -> Iterator[tuple[int, str]]:
         """Yield pairs: the number of feature cells that fit, and the name of the limit they fit into."""

@@ -36,9 +36,8 @@ RAYS_AT_ONCE = 1 << 12
 processed."""
 FIELD_RAYS_AT_ONCE = 1 << 13
 """Rays on which the field is evaluated at a time."""
-MOST_KEPT = 20_000_000
-"""Most samples of training rays that are kept in memory: 320 MB. Memory pages are only taken for the samples
-that there are."""
+KEPT_BYTES = 16
+"""Bytes of a fetch that is kept in memory: its point, and its length or weight, in float32."""
 N_TYPICAL = 4096
 """Training rays from which the typical size of composites is computed."""
 
@@ -65,8 +64,8 @@ class Fetches(NamedTuple):
     weights: np.ndarray
     """[n_fetches] float32 compositing weights."""
     lengths: np.ndarray
-    """[n_fetches] float32 length of the piece of ray that a sample stands for, model units; 0 if several
-    samples were merged into the fetch."""
+    """[n_fetches] float32 length of the piece of ray that a sample stands for, model units; empty if
+    densities are not trained and fetches are kept."""
     opacity: np.ndarray
     """[n] float32 opacity of the baked grid."""
 
@@ -125,8 +124,9 @@ class TeacherRays:
 class TrainingRays:
     """n of the teacher's rays, all of which meet something in the baked grid.
 
-    The fetches of a ray are computed whenever a batch needs them: in fog, the samples of all rays would take
-    more memory than the grid. Samples can be kept where they are few, which saves a quarter of a step's time.
+    The places of the fetches are kept if there is memory for them, which saves a third of a step's time. If
+    not, they are computed whenever a batch needs them: in fog, those of all rays would take more memory than
+    the grid.
     """
 
     teacher: TeacherRays
@@ -136,29 +136,25 @@ class TrainingRays:
     """Feature lookups of a ray (the player's k), 0 for every sample."""
     densities: VertexRows | None
     """Rows of the stored densities; None if densities are not trained."""
-    samples: KeptSamples | None = None
-    """Kept samples of all rays; None if they are not kept."""
+    kept: KeptFetches | None = None
+    """The fetches of all rays; None if they are not kept."""
 
     def __len__(self) -> int:
         return len(self.teacher.opacity)
 
     def some(self, n: int) -> TrainingRays:
-        """Return n of the rays, spread evenly; all of them if there are no more."""
-        return replace(self, teacher=self.teacher.some(n))
-
-    def with_samples(self) -> TrainingRays:
-        """Return the rays with all their samples kept, for callers that use them many times and compute the
-        weights themselves. Samples are not kept if they are too many, nor in contracted space, where the grid
-        takes the memory."""
-        return self if self.grid.contracted else replace(self, samples=_all_samples(self))
+        """Return n of the rays, spread evenly, without kept fetches; all of them if there are no more."""
+        return replace(self, teacher=self.teacher.some(n), kept=None)
 
     def fetches(self, some: np.ndarray) -> Fetches:
-        """Return the fetches of the rays whose numbers are in `some`, in that order. With kept `samples`,
-        weights and opacity are left uninitialised, for `weigh` to fill in."""
-        if self.samples is not None:
-            starts, points, lengths = self.samples.of(some)
-            weights, opacity = np.empty_like(lengths), np.empty(len(some), np.float32)
-            return self._placed(starts, points, weights, lengths, opacity)
+        """Return the fetches of the rays whose numbers are in `some`, in that order. If they are kept and
+        densities are trained, weights and opacity are left uninitialised, for `weigh` to fill in."""
+        if self.kept is not None:
+            starts, points, numbers = self.kept.of(some)
+            if self.densities is None:
+                return self._placed(starts, points, numbers, numbers[:0], self.kept.opacity[some])
+            weights, opacity = np.empty_like(numbers), np.empty(len(some), np.float32)
+            return self._placed(starts, points, weights, numbers, opacity)
         rays_o, rays_d = self.teacher.rays_o[some], self.teacher.rays_d[some]
         found = player_fetches(self.grid, rays_o, rays_d, self.n_fetches)
         counts, opacity = np.zeros(len(some), np.int64), np.zeros(len(some), np.float32)
@@ -199,39 +195,53 @@ class TrainingRays:
         return np.maximum(np.abs(composites).mean(axis=0), 1e-3)
 
 
-class KeptSamples(NamedTuple):
-    """The places of all samples of n rays, for fetches at every sample."""
+class KeptFetches(NamedTuple):
+    """The places of all fetches of n rays."""
 
     starts: np.ndarray
-    """[n + 1] int64: ray i has the samples starts[i] to starts[i + 1]."""
+    """[n + 1] int64: ray i has the fetches starts[i] to starts[i + 1]."""
     points: np.ndarray
-    """[n_samples, 3] float32 places, in cells of the densities' grid."""
-    lengths: np.ndarray
-    """[n_samples] float32 length of the piece of ray that a sample stands for, model units."""
+    """[n_fetches, 3] float32 places, in cells of the densities' grid."""
+    numbers: np.ndarray
+    """[n_fetches] float32: the lengths of the pieces of ray that the fetches stand for, model units, if
+    densities are trained; the fetches' weights if they are not."""
+    opacity: np.ndarray
+    """[n] float32 opacity of the baked grid before training."""
 
     def of(self, some: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return (starts, points, lengths) of the rays whose numbers are in `some`, in that order."""
+        """Return (starts, points, numbers) of the rays whose numbers are in `some`, in that order."""
         starts = np.concatenate([[0], np.cumsum(self.starts[some + 1] - self.starts[some])])
-        points, lengths = np.empty((starts[-1], 3), np.float32), np.empty(starts[-1], np.float32)
-        take_runs(some, self.starts, self.points, self.lengths, starts, points, lengths)
-        return starts, points, lengths
+        points, numbers = np.empty((starts[-1], 3), np.float32), np.empty(starts[-1], np.float32)
+        take_runs(some, self.starts, self.points, self.numbers, starts, points, numbers)
+        return starts, points, numbers
 
 
-def _all_samples(rays: TrainingRays) -> KeptSamples | None:
-    """Return all samples of `rays`; None if there are more than MOST_KEPT."""
-    n_rays, n = len(rays), 0
-    counts = np.zeros(n_rays, np.int64)
-    points, lengths = np.empty((MOST_KEPT, 3), np.float32), np.empty(MOST_KEPT, np.float32)
-    for first in range(0, n_rays, RAYS_AT_ONCE):
-        some = slice(first, first + RAYS_AT_ONCE)
-        found = player_fetches(rays.grid, rays.teacher.rays_o[some], rays.teacher.rays_d[some], 0)
-        end = n + len(found.lengths)
-        if end > MOST_KEPT:
-            return None
-        points[n:end], lengths[n:end] = found.points, found.lengths
-        counts[first + found.hits] = found.counts
-        n = end
-    return KeptSamples(np.concatenate([[0], np.cumsum(counts)]), points[:n], lengths[:n])
+class _Keeper:
+    """Keeps the fetches of rays that are marched some at a time, as long as they fit into `most` bytes."""
+
+    def __init__(self, most: int) -> None:
+        # Memory pages are only taken for the fetches that there are.
+        self._points = np.empty((most // KEPT_BYTES, 3), np.float32)
+        self._numbers = np.empty(most // KEPT_BYTES, np.float32)
+        self._counts, self._opacity, self._n = list[np.ndarray](), list[np.ndarray](), 0
+
+    def keep(self, found: PlayerFetches, numbers: np.ndarray) -> bool:
+        """Keep the fetches of some rays, and their lengths or weights in `numbers`. Return whether they still
+        fit."""
+        end = self._n + len(numbers)
+        if end > len(self._numbers):
+            return False
+        self._points[self._n : end], self._numbers[self._n : end] = found.points, numbers
+        self._counts.append(found.counts)
+        self._opacity.append(found.opacity)
+        self._n = end
+        return True
+
+    def kept(self) -> KeptFetches:
+        """Return the fetches of all rays that hit something."""
+        starts = np.concatenate([[0], np.cumsum(np.concatenate(self._counts))])
+        opacity = np.concatenate(self._opacity)
+        return KeptFetches(starts, self._points[: self._n], self._numbers[: self._n], opacity)
 
 
 def photographed_rays(model: Model, most: int, progress: Progress) -> TeacherRays:
@@ -283,7 +293,11 @@ def render_teacher(
 
 
 def collect_training_rays(
-    teacher: TeacherRays, grid: SparseGrid, n_fetches: int, densities: VertexRows | None = None
+    teacher: TeacherRays,
+    grid: SparseGrid,
+    n_fetches: int,
+    densities: VertexRows | None = None,
+    most_kept: int = 0,
 ) -> TrainingRays:
     """Select those of the teacher's rays that meet something in the grid.
 
@@ -292,17 +306,27 @@ def collect_training_rays(
         grid: the baked grid, as the player has it.
         n_fetches: feature lookups of a ray (the player's k), 0 for every sample.
         densities: rows of the stored densities, if they are trained too; this needs `n_fetches` = 0.
+        most_kept: bytes that the fetches of all rays may take; if they take more, they are not kept.
 
     Raises TrainingError if no ray meets anything.
     """
     meets = np.zeros(len(teacher.opacity), bool)
+    keeper = _Keeper(most_kept) if most_kept else None
     for first in range(0, len(meets), RAYS_AT_ONCE):
         rows = slice(first, first + RAYS_AT_ONCE)
-        sampled = sample_rays(grid, teacher.rays_o[rows], teacher.rays_d[rows], get_num_threads())
-        meets[rows] = -np.expm1(-sampled.tau) > MIN_OPACITY
+        rays = teacher.rays_o[rows], teacher.rays_d[rows]
+        if keeper is None:
+            sampled = sample_rays(grid, *rays, get_num_threads())
+            meets[rows] = -np.expm1(-sampled.tau) > MIN_OPACITY
+            continue
+        found = player_fetches(grid, *rays, n_fetches)
+        meets[first + found.hits] = True
+        if not keeper.keep(found, found.weights if densities is None else found.lengths):
+            keeper = None
     if not meets.any():
         raise TrainingError("the baked grid shows nothing in any training view: train longer")
-    return TrainingRays(teacher.chosen(np.flatnonzero(meets)), grid, n_fetches, densities)
+    kept = None if keeper is None else keeper.kept()
+    return TrainingRays(teacher.chosen(np.flatnonzero(meets)), grid, n_fetches, densities, kept)
 
 
 class PlayerFetches(NamedTuple):

@@ -55,11 +55,12 @@ FASTER = 0.6
 """Factor on the resolutions, and on the number of march steps of a ray, if frames take too long."""
 RAYS_OF_CELL = 2.0
 """Training rays for each stored cell of the features' grid."""
-RAY_BYTES = {False: 220, True: 120}
-"""Bytes that a training ray takes, by whether the scene is unbounded. The ray and its target colour take 40
-bytes; rays that meet something in the grid are copied, which takes 40 more; concatenating the rays takes
-another 40. Five of six of an object's rays meet something, and their samples are kept: eight or nine per ray,
-of 16 bytes each."""
+RAY_BYTES = 120
+"""Bytes that a training ray takes. The ray and its target colour take 40 bytes; rays that meet something in
+the grid are copied, which takes 40 more; concatenating the rays takes another 40."""
+REFINED_SHARE = 0.5
+"""Share of the bytes of a cell that it takes while refinement trains. What it takes only later, while codes
+are chosen, can hold fetches of the training rays until then."""
 CHANNEL_BYTES = 8.5
 """Bytes that a stored channel takes in a cell while codes are chosen. A cell has about 1.3 vertices. Each
 vertex has two bytes for the trained latent feature, and one each for the codes being tried, the best codes so
@@ -128,22 +129,23 @@ class Plan:
     """Factor by which the march steps are longer than usual, so that frames take less time."""
 
     @property
-    def ray_bytes(self) -> int:
-        return RAY_BYTES[self.unbounded]
-
-    @property
     def most_cells(self) -> int:
         """The number of cells that fit beside the training rays. If not all rays fit, they get a share of the
         room (RAYS_SHARE), because refinement gains little with few rays."""
-        every = self.most_rays * self.ray_bytes
-        rays = max(min(every, RAYS_SHARE * self.room), FEWEST_RAYS * self.ray_bytes)
+        rays = max(min(self.most_rays * RAY_BYTES, RAYS_SHARE * self.room), FEWEST_RAYS * RAY_BYTES)
         return int((self.room - rays) / self.cell_bytes)
 
     def n_rays(self, n_cells: float) -> int:
         """Return the number of training rays for `n_cells` cells: as many as the cells need and as fit beside
         them."""
-        left = (self.room - n_cells * self.cell_bytes) / self.ray_bytes
+        left = (self.room - n_cells * self.cell_bytes) / RAY_BYTES
         return int(np.clip(min(left, RAYS_OF_CELL * n_cells), FEWEST_RAYS, self.most_rays))
+
+    def kept_bytes(self, n_cells: float) -> int:
+        """Return the bytes that the fetches of all training rays may take while `n_cells` cells are
+        refined."""
+        taken = REFINED_SHARE * n_cells * self.cell_bytes + self.n_rays(n_cells) * RAY_BYTES
+        return int(max(self.room - taken, 0))
 
     def coarser(self) -> Plan:
         """Return the plan of a bake whose frames take less time: with coarser grids and longer steps."""
@@ -154,7 +156,7 @@ class Plan:
     @property
     def n_bytes(self) -> int:
         """Expected peak of memory, bytes."""
-        held = self.n_cells * self.cell_bytes + self.n_rays(self.n_cells) * self.ray_bytes
+        held = self.n_cells * self.cell_bytes + self.n_rays(self.n_cells) * RAY_BYTES
         return int(PROGRAM_BYTES + max(self.marks, min(held, self.room)))
 
 
@@ -187,7 +189,7 @@ def make_plan(model: Model, config: BakeConfig) -> Plan:
     plan = Plan(resolutions, wanted, n_cells, cell_bytes, field.unbounded, room, marks, page_cells, most_rays)
     plan = replace(plan, n_cells=min(plan.n_cells, max(plan.most_cells, 0), page_cells))
     if plan.most_cells <= 0 or marks > room:
-        least = PROGRAM_BYTES + max(marks, FEWEST_RAYS * plan.ray_bytes)
+        least = PROGRAM_BYTES + max(marks, FEWEST_RAYS * RAY_BYTES)
         raise ConfigError(
             f"max_memory: expected at least {np.ceil(least / 1e7) / 100:.2f} GB for {fine} cells "
             f"per axis, got {config.memory:.3g} GB: allow more, or lower --resolution and "

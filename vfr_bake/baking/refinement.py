@@ -143,8 +143,10 @@ class Tuning:
         held_out: HeldOut,
         report: Callable[[str, int, int], object],
         seconds: float,
+        most_kept: int = 0,
     ) -> None:
-        """`seconds` is the time that all rounds together may take, if the number of steps was not given."""
+        """`seconds` is the time that all rounds together may take, if the number of steps was not given, and
+        `most_kept` the bytes that the fetches of all training rays may take."""
         self.n_fetches = choice.n_fetches
         """Feature lookups of a ray, 0 for every sample."""
         self.ranges: tuple[Range, ...] | None = None
@@ -154,7 +156,7 @@ class Tuning:
         self.left_out: dict[str, str] = {}
         """Descriptions, by topic, of what was left out and what that changed."""
         self._config, self._choice = config, choice
-        self._held_out, self._report = held_out, report
+        self._held_out, self._report, self._most_kept = held_out, report, most_kept
         self._until = time.monotonic() + (seconds if config.refine_steps is None else float("inf"))
 
     def run(self, stored: Stored, layout: Layout, teacher: TeacherRays, again: Callable[[], Parts]) -> Stored:
@@ -172,7 +174,7 @@ class Tuning:
         head_rate, code_rate = HEAD_RATE, CODE_RATE * choice.code_levels / 127
         before = self._held_out.stages[-1]
         densities = grid.rows if layout.densities is layout.features else layout.densities.rows()
-        rays = collect_training_rays(teacher, grid, 0, densities)
+        rays = collect_training_rays(teacher, grid, 0, densities, self._most_kept)
         if choice.head_width:
             stored = replace(stored, head=self._new_head(stored.head, rays.typical(stored.features)))
             with self._steps("small head", small_head_steps(choice)) as steps:
@@ -241,7 +243,7 @@ class Tuning:
     ) -> Stored:
         """Refine head and features with the lookups and bits that are played, and keep the result if it gains
         anything. Changes the features of `stored` in place."""
-        rays = collect_training_rays(teacher, grid, self.n_fetches)
+        rays = collect_training_rays(teacher, grid, self.n_fetches, most_kept=self._most_kept)
         asked = refined_steps(self._config, self._choice, len(rays))
         left = stored.features.astype(np.int8)  # the low bytes, which `whole_codes` rounds away
         with self._steps("refinement at k", asked) as steps:
@@ -414,8 +416,6 @@ def refine(
     squares, density_squares = np.zeros(len(features), np.float32), np.zeros(len(density), np.float32)
     low, slope = decode_constants(density_range or (0.0, 0.0))
     n_channels, n_parts = features.shape[1], get_num_threads()
-    if density_range is not None:
-        rays = rays.with_samples()
     muon = Muon(head.parameters())
     for step in steps:
         falling = steps.falling(step)

@@ -37,8 +37,10 @@ from vfr_bake.baking.plan import (
     OWN_HEAD,
     OWN_REST_COST,
     PROGRAM_BYTES,
+    RAY_BYTES,
     RAYS_OF_CELL,
     RAYS_OF_DRAW,
+    REFINED_SHARE,
     STEP_COST,
     UNBOUNDED_RAYS,
     VERTEX_COST,
@@ -256,8 +258,18 @@ def test_as_many_cells_as_fit_leave_room_for_the_rays_that_teach_them(unbounded:
     plan = replace(plan, unbounded=unbounded, cell_bytes=244.0, most_rays=enough)
     for gigabytes in (1.0, 3.2, 12.0):
         room = replace(plan, room=1e9 * gigabytes)
-        assert room.n_rays(room.most_cells) >= min(0.299e9 * gigabytes / room.ray_bytes, 0.999 * enough)
+        assert room.n_rays(room.most_cells) >= min(0.299e9 * gigabytes / RAY_BYTES, 0.999 * enough)
         assert room.most_cells * room.cell_bytes > 0.69 * room.room
+
+
+def test_fetches_of_training_rays_are_kept_in_memory_that_cells_and_rays_leave(model: Model) -> None:
+    """Beside the rays, fetches have the part of the memory that cells do not take, or take only later."""
+    plan = make_plan(model, BakeConfig(resolution=48))
+    plan = replace(plan, cell_bytes=244.0, most_rays=N_RAYS, room=1e9)
+    for n_cells in (1e4, 1e6, 4e6):
+        rays = plan.n_rays(n_cells) * RAY_BYTES
+        assert plan.kept_bytes(n_cells) == pytest.approx(1e9 - REFINED_SHARE * n_cells * 244 - rays, abs=1)
+    assert plan.kept_bytes(1e8) == 0
 
 
 def test_a_small_scene_is_learned_from_fewer_rays(model: Model) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import tracemalloc
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -72,21 +73,28 @@ def test_training_rays_are_those_that_meet_something(
     assert len(one) == 1 and np.array_equal(one.composed(latent(grid.features))[0], composed[:1])
 
 
-def test_kept_samples_are_those_that_are_found_anew(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Kept samples give all rays the same fetches as new ones, in any order; too many are not kept."""
+@pytest.mark.parametrize("n_fetches", [0, 4])
+def test_kept_fetches_are_those_that_are_found_anew(n_fetches: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Kept fetches give all rays the same fetches as new ones, in any order; too many are not kept."""
     monkeypatch.setattr("vfr_bake.baking.distillation.RAYS_AT_ONCE", 2)
     grid, rays = fog(0.1), teacher_rays([ALONG, (-0.5, 0.3, 0.2), PAST, ALONG])  # the second begins inside
-    training_rays = collect_training_rays(rays, grid, 0, grid.rows)
-    kept, some = training_rays.with_samples(), np.array([2, 0, 1, 1])
-    assert kept.samples is not None and len(kept.samples.lengths) > 3 * 60
-    anew, found = training_rays.fetches(some), kept.fetches(some)
-    for name in ("starts", "lengths"):
-        assert np.array_equal(getattr(found, name), getattr(anew, name))
+    densities = None if n_fetches else grid.rows
+    names = ["starts", "weights", "opacity"] if n_fetches else ["starts", "lengths"]
+    collect = partial(collect_training_rays, rays, grid, n_fetches, densities)
+    anew, kept, some = collect(), collect(10**6), np.array([2, 0, 1, 1])
+    assert anew.kept is None and kept.kept is not None
+    assert np.array_equal(kept.teacher.rays_o, anew.teacher.rays_o)
+    n = len(kept.kept.numbers)
+    assert n == 12 if n_fetches else n > 3 * 60
+    expected, found = anew.fetches(some), kept.fetches(some)
+    for name in names:
+        assert np.array_equal(getattr(found, name), getattr(expected, name))
     for name in ("features", "densities"):
-        for a, b in zip(getattr(found, name), getattr(anew, name), strict=True):
+        for a, b in zip(getattr(found, name), getattr(expected, name), strict=True):
             assert np.array_equal(a, b)
-    monkeypatch.setattr("vfr_bake.baking.distillation.MOST_KEPT", 100)
-    assert training_rays.with_samples().samples is None
+    few = collect(16 * n - 1)
+    assert few.kept is None and len(few) == 3
+    assert kept.some(2).kept is None
 
 
 def test_the_samples_of_all_rays_are_not_held(monkeypatch: pytest.MonkeyPatch) -> None:
