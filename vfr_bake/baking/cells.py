@@ -11,6 +11,7 @@ sample. So a cell is stored only if samples that the model's sampler chose on so
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -353,15 +354,21 @@ def corners_of(cells: np.ndarray) -> np.ndarray:
     return cells
 
 
-def subdivided(cells: np.ndarray, resolution: int, planes: slice = slice(None)) -> np.ndarray:
+def subdivided(
+    cells: np.ndarray, resolution: int, region: Sequence[slice] = (slice(None),) * 3
+) -> np.ndarray:
     """Resample `cells` [n, n, n] bool to a grid of `resolution` over the same box: a cell is marked if its
-    centre is in a marked cell. Returns [n_planes, resolution, resolution] bool, the `planes` along x.
+    centre is in a marked cell. Returns [nx, ny, nz] bool, the `region` of that grid, a slice for each axis.
 
     >>> subdivided(np.array([True, False]).reshape(2, 1, 1).repeat(2, 1).repeat(2, 2), 5)[:, 0, 0].tolist()
     [True, True, False, False, False]
     """
     which = (2 * np.arange(resolution) + 1) * len(cells) // (2 * resolution)
-    return cells[np.ix_(which[planes], which, which)]
+    x, y, z = (which[part] for part in region)
+    box = cells[x[0] : x[-1] + 1, y[0] : y[-1] + 1, z[0] : z[-1] + 1]
+    if not box.any():
+        return np.zeros((len(x), len(y), len(z)), bool)
+    return box[np.ix_(x - x[0], y - y[0], z - z[0])]
 
 
 def lattice_step(resolution: int) -> float:

@@ -36,8 +36,9 @@ from vfr_bake.kernels.latent_rows import LARGEST_LATENT, PARTS, PARTS_BITS
 from vfr_bake.kernels.stored_features import table
 from vfr_bake.training.model_file import Model
 
-SLAB = 64
-"""Planes of vertices that are found at a time."""
+SIDE = 64
+"""Vertices along each side of the blocks in which vertices are found: small enough that most of the blocks
+hold none and are passed over, whole bricks wide."""
 VERTEX_CHUNK = 1 << 18
 """Vertices that are evaluated at a time: 32 MB of features."""
 FAINTEST, DENSEST = 1e-5, 20.0
@@ -235,20 +236,28 @@ def _chunks(vertices: GridVertices, contracted: bool) -> Iterator[tuple[slice, n
 def _corners(cells: np.ndarray, resolution: int) -> GridVertices:
     """Return the corners of those cells of a grid of `resolution` that lie in `cells` [n, n, n] bool.
 
-    They are found and sorted slab by slab, because a whole fine grid would take gigabytes. The result is in
-    order, because slabs are whole bricks thick and bricks are sorted along x first.
+    They are found block by block and sorted slab by slab, because a whole fine grid would take gigabytes. The
+    result is in order, because slabs are whole bricks thick and bricks are sorted along x first.
     """
-    parts = []
-    for first in range(0, resolution + 1, SLAB):
-        last = min(first + SLAB, resolution + 1)
-        before = max(first - 1, 0)  # a vertex is a corner of the cells on both sides of it
-        corners = corners_of(subdivided(cells, resolution, slice(before, last)))
-        index = np.argwhere(corners[first - before : last - before]).astype(np.int16)
-        index[:, 0] += first
+    parts, firsts = [], range(0, resolution + 1, SIDE)
+    for x in firsts:
+        blocks = [_corners_in_block(cells, resolution, (x, y, z)) for y in firsts for z in firsts]
+        index = np.concatenate(blocks)
         coords, masks, order = pack_vertices(index)
         parts.append((coords, masks, index[order]))
     coords, masks, index = (np.concatenate(column) for column in zip(*parts, strict=True))
     return GridVertices(coords, masks, index, resolution)
+
+
+def _corners_in_block(cells: np.ndarray, resolution: int, first: tuple[int, int, int]) -> np.ndarray:
+    """Return those of the corners [n, 3] int16 that are in the block of SIDE^3 vertices from `first` on."""
+    before = [max(at - 1, 0) for at in first]  # a vertex is a corner of the cells on both sides of it
+    last = [min(at + SIDE, resolution + 1) for at in first]
+    fine = subdivided(cells, resolution, [slice(*of_axis) for of_axis in zip(before, last, strict=True)])
+    if not fine.any():
+        return np.zeros((0, 3), np.int16)
+    inside = tuple(slice(a - b, c - b) for a, b, c in zip(first, before, last, strict=True))
+    return (np.argwhere(corners_of(fine)[inside]) + first).astype(np.int16)
 
 
 def unit_points(index: np.ndarray, resolution: int, contracted: bool) -> np.ndarray:

@@ -69,7 +69,7 @@ def test_where_a_density_is_stored_there_are_features(model: Model) -> None:
 
 def test_vertices_are_put_in_order_slab_by_slab(monkeypatch: pytest.MonkeyPatch) -> None:
     """Vertices are sorted slab by slab: all at once, the 35 million of a room took 5 GB."""
-    monkeypatch.setattr("vfr_bake.baking.grids.SLAB", 8)
+    monkeypatch.setattr("vfr_bake.baking.grids.SIDE", 8)
     cells = np.random.default_rng(0).random((10, 10, 10)) < 0.6
     tracemalloc.start()
     try:
@@ -79,7 +79,7 @@ def test_vertices_are_put_in_order_slab_by_slab(monkeypatch: pytest.MonkeyPatch)
         tracemalloc.stop()
     assert len(vertices) > 700_000 and peak < 50 * len(vertices)
     assert (unpack_vertices(vertices.coords, vertices.masks) == vertices.index).all()
-    monkeypatch.setattr("vfr_bake.baking.grids.SLAB", 64)
+    monkeypatch.setattr("vfr_bake.baking.grids.SIDE", 64)
     for slabs, whole in zip(vars(vertices).values(), vars(_corners(cells, 110)).values(), strict=True):
         assert np.array_equal(slabs, whole)
 
