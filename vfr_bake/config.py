@@ -359,9 +359,9 @@ class BakeConfig:
     """Bits of the head's wide layers, 8 or 32 (float32): 8 play about twice as fast, and stay only where they
     lose no more than the preset allows, or where --target-ms limits the time of a frame."""
     refine_steps: int | None = None
-    """Steps of each round in which head and stored values are adapted to each other, to show what photographs
-    and the full model show; 0: none, with the model's own head. If not given, the preset's, or as many as
-    there is time for."""
+    """Steps in which head and stored values are adapted to each other, to show what photographs and the full
+    model show; two thirds as many follow with the lookups and bits that are played. 0: none, with the model's
+    own head. If not given, the preset's, or as many as there is time for."""
     mesh_resolution: int | None = None
     """The mesh gets the faces that a grid of so many voxels along the box would give it; 0: as many as its
     bytes allow, a tenth of the asset's."""

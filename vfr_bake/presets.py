@@ -48,7 +48,8 @@ class BakeChoice:
     head_bits: int
     """Bits of the head's wide layers, 8 or 32."""
     refine_steps: int
-    """Steps of each round of refinement."""
+    """Steps of refinement before the lookups and bits are chosen that are played; two thirds as many follow
+    with these."""
     minutes: float = 8
     """Wall-clock minutes of a bake, roughly: refinement takes fewer steps if the machine is too slow for all
     of them, unless their number was asked for."""
@@ -69,7 +70,7 @@ PRESETS: dict[Preset, BakeChoice] = {
         cells_per_pixel=1.95, contracted_resolution=1536, feature_share=0.68, culled_loss_db=0.02,
         n_channels=22, channel_loss_db=0.03, n_fetches=16, sample_loss_db=0.005,
         code_loss_db=0.02, density_step=2, code_levels=127, head_width=0, head_layers=3,
-        head_bands=4, head_bits=8, refine_steps=1600, mesh_resolution=128, target_loss_db=0.05,
+        head_bands=4, head_bits=8, refine_steps=1200, mesh_resolution=128, target_loss_db=0.05,
         page_mb=1024,
     ),
     "balanced": BakeChoice(
@@ -77,7 +78,7 @@ PRESETS: dict[Preset, BakeChoice] = {
         cells_per_pixel=1.65, contracted_resolution=1408, feature_share=0.775, culled_loss_db=0.06,
         n_channels=16, channel_loss_db=0.15, n_fetches=12, sample_loss_db=0.05,
         code_loss_db=0.13, density_step=4, code_levels=50, head_width=64, head_layers=3,
-        head_bands=4, head_bits=8, refine_steps=3600, mesh_resolution=128, target_loss_db=0.4,
+        head_bands=4, head_bits=8, refine_steps=3000, mesh_resolution=128, target_loss_db=0.4,
         page_mb=512,
     ),
     "fast": BakeChoice(
@@ -85,7 +86,7 @@ PRESETS: dict[Preset, BakeChoice] = {
         cells_per_pixel=1.55, contracted_resolution=640, feature_share=0.68, culled_loss_db=0.1,
         n_channels=16, channel_loss_db=0.25, n_fetches=12, sample_loss_db=0.1,
         code_loss_db=0.67, density_step=6, code_levels=50, head_width=48, head_layers=1,
-        head_bands=3, head_bits=8, refine_steps=4000, mesh_resolution=48, target_loss_db=1.0,
+        head_bands=3, head_bits=8, refine_steps=3600, mesh_resolution=48, target_loss_db=1.0,
         page_mb=512,
     ),
     "phone": BakeChoice(

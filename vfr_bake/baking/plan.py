@@ -27,7 +27,7 @@ from vfr_bake.baking.cells import (
 from vfr_bake.baking.distillation import render_teacher
 from vfr_bake.baking.held_out import BETWEEN
 from vfr_bake.baking.limits import WIDTHS, cells_of_page
-from vfr_bake.baking.refinement import BATCH, HEAD_BATCH, head_steps, refined_steps
+from vfr_bake.baking.refinement import BATCH, HEAD_BATCH, head_steps, refined_steps, steps_at_k
 from vfr_bake.config import BakeConfig
 from vfr_bake.kernels import SOURCES
 from vfr_bake.presets import BakeChoice
@@ -78,16 +78,16 @@ VIEWS_TIMED, MOST_TIMED = 4, 25_000
 twice as many as in the bakes by which the costs below were measured, and few enough to take only seconds if
 there are few views. The timed rays differ from those of the run before, which compiles the code: the memory
 that those have read is in the cache, where rays are several times as fast as the millions of a bake."""
-STEP_COST, HEAD_COST = {False: 4.8, True: 0.7}, {False: 1.3, True: 0.6}
+STEP_COST, HEAD_COST = {False: 3.4, True: 0.6}, {False: 1.3, True: 0.6}
 """Time of a training ray in a step of refinement, and in a step that trains the head alone, by whether the
 scene is unbounded. The unit is the time that the teacher takes for a ray, which is several times as long in
 an unbounded scene. All costs here are times of the main thread, measured on two cores
 (docs/notes/2026-11-24-bakes-of-weak-models.md)."""
 VERTEX_COST, SEEN_COST = {False: 0.17, True: 0.18}, {False: 0.48, True: 1.0}
 """Time to evaluate a vertex, and time of a ray that marks the cells it sees, in the same unit."""
-ROUNDS = {False: 1.0, True: 1.5}
-"""Expected rounds of refinement. About every second capture needs a further round with the number of lookups
-and the bits that are played; an object hardly ever does."""
+AT_K_COST = 0.7
+"""Time of a step of refinement with the lookups and bits that are played, as a share of that of a step before
+these were chosen."""
 OWN_HEAD = 2
 """Factor on the time of a step with the model's own head."""
 REST_COST, OWN_REST_COST = {False: 12_000_000, True: 5_000_000}, {False: 20_000_000, True: 3_700_000}
@@ -273,7 +273,7 @@ def expected_seconds(model: Model, config: BakeConfig, plan: Plan) -> float:
         steps = max(model.occupancy.step * coarse / 2, 1.0)
         work += SEEN_COST[False] * steps * rays_of_views(model, coarse)
     n_steps = refined_steps(config, choice, n_met)
-    refined = ROUNDS[unbounded] * n_steps * BATCH * STEP_COST[unbounded]
+    refined = (n_steps + AT_K_COST * steps_at_k(n_steps)) * BATCH * STEP_COST[unbounded]
     refined += head_steps(choice) * HEAD_BATCH * HEAD_COST[unbounded]
     before, refinement = ray_seconds * work, ray_seconds * refined * (1 if choice.head_width else OWN_HEAD)
     if config.refine_steps is None:

@@ -61,35 +61,27 @@ overfit to those rays."""
 PASSES = 10
 """Passes of a round of refinement over the training rays, unless they take more steps than the preset has. So
 a small scene, whose vertices can be trained with few rays, takes few steps."""
-HEAD_STEPS, LAST_STEPS = 2000, 1000
-"""Steps in which a small head is trained alone before refinement, and steps in which a head is trained alone
-for the feature lookups and bits with which it is played; the latter never exceed those of refinement."""
+HEAD_STEPS = 2000
+"""Steps in which a small head is trained alone before refinement."""
 HEAD_SHARE = 3
 """Most steps of a small head for each step that refinement may take. They take a fifth of the time or less,
 and refinement would have to make up for what the head has not learned."""
 AT_K = 0.25
 """Factor on the head's learning rate in the last round, where little is left to be learned."""
+AT_K_STEPS = 2 / 3
+"""Steps of the last round, with the lookups and bits that are played, for each step of the first. They take
+half of the time, because densities stay and a ray has fewer fetches, and teach nearly as much
+(docs/notes/2026-11-30-a-round-with-the-lookups-that-are-played.md)."""
 N_HEAD = 1_000_000
 """Rays on which a head is trained alone; their composites are computed once."""
-SHARES = {"small head": 0.2, "refinement": 0.8, "head at k": 1.0, "refinement at k": 1.0}
+SHARES = {"small head": 0.2, "refinement": 0.7, "refinement at k": 1.0}
 """Share of the remaining time that each round may take."""
-HEAD_SECONDS = 20.0
-"""Seconds that training the head may take in the last round in any case: enough to learn most of what it
-can."""
-FEATURES_SECONDS = 60.0
-"""Seconds that must remain for the features to be trained in the last round: less time gains nothing."""
 DIRECTION_SHARE = 0.1
 """A small head ignores the direction if that loses at most this share of the preset's target loss."""
 ROUNDING_LEFT = 0.5
 """Expected share of a head's loss by 8 bits that remains after it was trained with them."""
 BITS_SHARE = 0.5
 """Share of the preset's target loss that a head may lose by 8 bits after it was trained with them."""
-WORTH_A_ROUND = 0.1
-"""Loss in dB by fewer lookups and a head in 8 bits above which the head is trained with them."""
-WORTH_FEATURES = 0.15
-"""Loss in dB by fewer lookups and a head in 8 bits above which the features are trained, too. It is exceeded
-if rays have a hundred samples with weight, as in the fog of a model that has hardly learned: then a few
-lookups show something else."""
 MOST_FAR_OFF = 1e-4
 """Largest share of the pixels that may be far off because of fewer lookups. A lookup between two surfaces
 makes a pixel stand out, although it hardly changes the mean error: lego's fast asset has 870 such pixels in a
@@ -111,20 +103,20 @@ class Stored:
 
 
 def refined_steps(config: BakeConfig, choice: BakeChoice, n_rays: float) -> int:
-    """Return the steps of a round of refinement with `n_rays` training rays that meet something, unless the
-    number of steps was given."""
+    """Return the steps of the first round of refinement with `n_rays` training rays that meet something,
+    unless the number of steps was given."""
     most = choice.refine_steps
     return most if config.refine_steps is not None else min(int(PASSES * n_rays / BATCH) + 1, most)
 
 
+def steps_at_k(refined: int) -> int:
+    """Return the steps of the last round after `refined` steps of the first."""
+    return int(np.ceil(AT_K_STEPS * refined))
+
+
 def head_steps(choice: BakeChoice) -> int:
-    """Return the steps in which the head is trained alone, before and after refinement together."""
-    return (small_head_steps(choice) if choice.head_width else 0) + min(LAST_STEPS, choice.refine_steps)
-
-
-def small_head_steps(choice: BakeChoice) -> int:
     """Return the steps in which a small head is trained alone before refinement."""
-    return min(HEAD_STEPS, HEAD_SHARE * choice.refine_steps)
+    return min(HEAD_STEPS, HEAD_SHARE * choice.refine_steps) if choice.head_width else 0
 
 
 class Tuning:
@@ -177,7 +169,7 @@ class Tuning:
         rays = collect_training_rays(teacher, grid, 0, densities, self._most_kept)
         if choice.head_width:
             stored = replace(stored, head=self._new_head(stored.head, rays.typical(stored.features)))
-            with self._steps("small head", small_head_steps(choice)) as steps:
+            with self._steps("small head", head_steps(choice)) as steps:
                 stored = replace(stored, head=train_head(stored, rays.some(N_HEAD), steps, NEW_HEAD_RATE))
             before = self._held_out.measure("small head", grid, runner(stored.head), 0)
             head_rate = NEW_HEAD_RATE / 2
@@ -203,20 +195,8 @@ class Tuning:
                 move_towards(stored.features, again(), 1.0)
                 del grid
                 grid = layout.grid(stored.density, stored.features)
-        every = self._held_out.look("all", grid, runner(stored.head), 0)
         self.kept = self._choose_lookups_and_bits(stored, grid, teacher)
-        lost = self._held_out.lost(every.shown, self.kept.shown).most
-        if self.n_fetches and lost > WORTH_FEATURES and self._seconds_left() > FEATURES_SECONDS:
-            return self._refined_at_k(stored, grid, teacher, AT_K * head_rate, code_rate)
-        if lost > WORTH_A_ROUND:
-            rays = collect_training_rays(teacher.some(N_HEAD), grid, self.n_fetches)
-            with self._steps("head at k", min(LAST_STEPS, choice.refine_steps)) as steps:
-                head = train_head(stored, rays, steps, AT_K * head_rate, self.ranges)
-            after = self._held_out.measure("head at k", grid, runner(head, self.ranges), self.n_fetches)
-            if self._gained("head at k", self.kept, after):
-                self.kept = after
-                return self._in_enough_bits(stored, replace(stored, head=head))
-        return self._in_enough_bits(stored, stored)
+        return self._refined_at_k(stored, grid, teacher, AT_K * head_rate, code_rate)
 
     def _in_enough_bits(self, stored: Stored, tuned: Stored) -> Stored:
         """Return `tuned`; or `stored`, with its head in float32, if 8 bits lose too much even after
@@ -244,7 +224,7 @@ class Tuning:
         """Refine head and features with the lookups and bits that are played, and keep the result if it gains
         anything. Changes the features of `stored` in place."""
         rays = collect_training_rays(teacher, grid, self.n_fetches, most_kept=self._most_kept)
-        asked = refined_steps(self._config, self._choice, len(rays))
+        asked = steps_at_k(refined_steps(self._config, self._choice, len(rays)))
         left = stored.features.astype(np.int8)  # the low bytes, which `whole_codes` rounds away
         with self._steps("refinement at k", asked) as steps:
             tuned = refine(stored, rays, steps, None, head_rate, code_rate, self.ranges)
@@ -264,18 +244,13 @@ class Tuning:
     def _steps(self, name: str, asked: int) -> Iterator[Steps]:
         """Give the steps of round `name`, up to `asked`, within its share of the remaining time. Afterwards,
         note the steps that were left out."""
-        seconds = SHARES[name] * self._seconds_left()
-        if name == "head at k":
-            seconds = max(seconds, HEAD_SECONDS)
+        seconds = SHARES[name] * (self._until - time.monotonic())
         yield (steps := Steps(asked, partial(self._report, name), seconds))
         self._until += steps.paused
         if steps.n < asked:
             self.left_out[f"steps of {name!r}"] = (
                 f"{asked - steps.n:,} of {asked:,}: they would take too long"
             )
-
-    def _seconds_left(self) -> float:
-        return self._until - time.monotonic()
 
     def _gained(self, name: str, before: Stage, after: Stage) -> bool:
         """Return whether less is lost than before, on pixels that nothing is trained on; if not, note that
@@ -371,17 +346,14 @@ class Steps:
         return float(0.5 * (1 + np.cos(np.pi * step / self.n)))
 
 
-def train_head(
-    stored: Stored, rays: TrainingRays, steps: Steps, rate: float, ranges: tuple[Range, ...] | None = None
-) -> HeadWeights:
+def train_head(stored: Stored, rays: TrainingRays, steps: Steps, rate: float) -> HeadWeights:
     """Train the head alone, on the squared error of the colours over random backgrounds.
 
-    The stored values stay as they are, so the rays' composites are computed only once. With `ranges`, the
-    head is trained as it is played in 8 bits (`vfr_bake.baking.head`).
+    The stored values stay as they are, so the rays' composites are computed only once.
     """
     random = np.random.default_rng(0)
     torch.manual_seed(0)
-    head = FoldedHead(stored.head, UNIT * rays.typical(stored.features), ranges)
+    head = FoldedHead(stored.head, UNIT * rays.typical(stored.features))
     muon = Muon(head.parameters())
     composed, opacity = (torch.from_numpy(of_rays) for of_rays in rays.composed(stored.features))
     for step in steps:

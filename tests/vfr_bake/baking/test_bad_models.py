@@ -42,12 +42,12 @@ def test_a_floor_that_no_cell_reaches_is_refused(model: Model, tmp_path: Path) -
 
 
 def test_a_grid_becomes_coarser_where_memory_does_not_hold_it(model: Model, tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"max_memory: expected at least 0\.83 GB for 48 .* got 0\.8 "):
+    with pytest.raises(ConfigError, match=r"max_memory: expected at least 0\.82 GB for 48 .* got 0\.8 "):
         bake(model, tmp_path / "asset", BakeConfig(resolution=48, max_memory=0.8), silent)
     assert list(tmp_path.iterdir()) == []
-    settings = BakeConfig(resolution=48, max_memory=0.824, refine_steps=0, check_views=1)
+    settings = BakeConfig(resolution=48, max_memory=0.814, refine_steps=0, check_views=1)
     result = bake(model, tmp_path / "asset", settings, silent)
-    assert "do not fit into 0.824 GB" in result.figures["left_out"]["resolution"]
+    assert "do not fit into 0.814 GB" in result.figures["left_out"]["resolution"]
     assert 8 <= Asset.open(tmp_path / "asset").manifest.resolution < 48
 
 

@@ -25,6 +25,7 @@ from vfr_bake.baking.grids import Layout
 from vfr_bake.baking.limits import RESERVE, file_sizes, keep_to_time
 from vfr_bake.baking.mesh import bake_mesh
 from vfr_bake.baking.plan import (
+    AT_K_COST,
     CHOSEN_COST,
     COMPILE_SECONDS,
     CULLING_BYTES,
@@ -401,9 +402,9 @@ def test_what_is_chosen_of_many_vertices_is_expected_to_take_longer(
     one_step = replace(config, refine_steps=1)
     own = expected_seconds(model, replace(one_step, head_width=0), plan)
     small = expected_seconds(model, one_step, plan)
-    step, alone = BATCH * STEP_COST[False], HEAD_BATCH * HEAD_COST[False]
-    # a small head is also trained before refinement
-    steps = OWN_HEAD * (step + alone) - (step + (1 + HEAD_SHARE) * alone)
+    rounds = (1 + AT_K_COST) * BATCH * STEP_COST[False]  # a step of each
+    # a small head is also trained alone, before refinement
+    steps = OWN_HEAD * rounds - (rounds + HEAD_SHARE * HEAD_BATCH * HEAD_COST[False])
     assert own - small == pytest.approx(OWN_REST_COST[False] + steps, rel=1e-6)
 
 

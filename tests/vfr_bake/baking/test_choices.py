@@ -105,7 +105,7 @@ def test_a_pause_in_a_round_takes_no_time_from_the_next(monkeypatch: pytest.Monk
             now += 2**-6
             now += 3600 if step == 500 else 0  # the machine sleeps
     assert not tuning.left_out
-    assert tuning._seconds_left() == pytest.approx(100 - 999 / 2**6 - LONGEST_STEP)
+    assert tuning._until - now == pytest.approx(100 - 999 / 2**6 - LONGEST_STEP)
 
 
 @pytest.mark.parametrize(("max_loss_db", "steps"), [(None, (1, 2, 4)), (0.5, (1, 2, 2)), (0.4, (1, 1, 1))])

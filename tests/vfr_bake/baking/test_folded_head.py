@@ -12,8 +12,9 @@ import torch
 from exporters.head.onnx_head import HeadWeights, head_onnx
 from exporters.head.ranges import activation_ranges
 from player.head.graph import Activation
+from vfr_bake.baking.grids import latent
 from vfr_bake.baking.head import FoldedHead, fold_head, runner
-from vfr_bake.baking.refinement import HEAD_RATE, Steps, Stored, train_head
+from vfr_bake.baking.refinement import HEAD_RATE, Steps, Stored, refine
 from vfr_bake.config import FieldConfig
 from vfr_bake.field.networks import HeadNetwork
 
@@ -66,9 +67,9 @@ def test_refinement_gets_back_what_8_bits_lose() -> None:
         composed, _ = training_rays.composed(stored.features)
         return float(np.mean((runner(stored.head, ranges)(composed, dirs) - wanted) ** 2))
 
-    stored = Stored(weights, codes, np.zeros(len(codes), np.float32))
+    stored = Stored(weights, latent(codes), np.zeros(len(codes), np.float32))
     steps = Steps(400, lambda done, of: None)
-    tuned = replace(stored, head=train_head(stored, training_rays, steps, HEAD_RATE, ranges))
+    tuned = refine(stored, training_rays, steps, None, HEAD_RATE, 0, ranges)
     assert error(tuned) < 0.8 * error(stored)
     untouched = replace(tuned, head=weights)
     assert error(untouched) == pytest.approx(error(stored), rel=1e-6)
