@@ -32,7 +32,8 @@ class BakeChoice:
     sample_loss_db: float
     """Largest loss in dB for which fewer lookups are taken."""
     code_loss_db: float
-    """Approximate loss in dB from the choice of stored values alone: the more, the fewer bytes."""
+    """Approximate loss in dB on training pixels from the choice of stored values, beside what rounding to
+    whole codes loses: the more, the fewer bytes."""
     density_step: int
     """Quantization step of the densities: difference between neighbouring codes that are stored, of 0 to
     255."""

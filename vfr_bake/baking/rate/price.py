@@ -140,12 +140,11 @@ class PriceSearch:
         return highest_price(self._share_of(most_db), self._first, 0.0 if most_db > 0 else self._lowest)
 
     def for_preset(self, allowed_db: float) -> float:
-        """Return the same price for a loss that a preset allows, which is a wish and no limit: if rounding to
-        whole codes alone loses more, a price may add `allowed_db` to that."""
-        price = highest_price(self._share_of(allowed_db), self._first, self._lowest)
-        if self._losses[price] <= allowed_db:
-            return price
-        most_db = self._losses[price] + allowed_db
+        """Return the same price for a preset, which allows `allowed_db` more than rounding to whole codes
+        alone loses. If that counted, bytes would depend on whether it is a little more or a little less than
+        is allowed."""
+        self._share_of(0.0)(self._lowest)
+        most_db = max(self._losses[self._lowest], 0.0) + allowed_db
         return highest_price(self._share_of(most_db), self._first, self._lowest)
 
     def for_bytes(self, price: float, megabytes: Callable[[float], float], max_mb: float) -> float:

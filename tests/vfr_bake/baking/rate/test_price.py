@@ -40,14 +40,15 @@ def test_the_price_loses_little_less_than_it_may_and_its_values_are_not_chosen_a
     assert found.at(price).arrays == price and len(prices.tried) == n_tried <= 6
 
 
-def test_what_rounding_loses_alone_does_not_count_for_a_preset() -> None:
-    """Rounding loses three times what the preset allows; prices may add what it allows to that loss."""
-    found, _ = search(rounding_db=0.3)
+@pytest.mark.parametrize("rounding_db", [-0.01, 0.0, 0.09, 0.11, 0.3])
+def test_what_rounding_loses_alone_does_not_count_for_a_preset(rounding_db: float) -> None:
+    """Prices may add what a preset allows to the loss by rounding alone, however large that is."""
+    found, _ = search(rounding_db=rounding_db)
     price = found.for_preset(0.1)
     lowest = LOWEST_PRICE / FIRST_PRICE
-    rounding = 0.3 + 0.1 * lowest**0.7
-    assert lowest < price and 0.1 * price**0.7 <= rounding + 0.1 - 0.3
-    assert found.for_loss(0.1) < 1e-3 * price, "a limit is a limit"
+    rounding = max(rounding_db + 0.1 * lowest**0.7, 0.0)
+    assert CLOSE * (rounding + 0.1) <= rounding_db + 0.1 * price**0.7 <= rounding + 0.1
+    assert found.for_loss(0.1) <= price, "a limit is a limit"
 
 
 def test_bytes_that_fit_keep_the_price_and_others_raise_it() -> None:
