@@ -12,6 +12,7 @@ With the field's own features in place of the stored codes, the same map gives t
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -38,6 +39,8 @@ FIELD_RAYS_AT_ONCE = 1 << 13
 """Rays on which the field is evaluated at a time."""
 KEPT_BYTES = 16
 """Bytes of a fetch that is kept in memory: its point, and its length or weight, in float32."""
+N_PROBED = 8
+"""Batches of rays after which it is judged whether fetches are worth keeping."""
 N_TYPICAL = 4096
 """Training rays from which the typical size of composites is computed."""
 
@@ -216,18 +219,32 @@ class KeptFetches(NamedTuple):
         return starts, points, numbers
 
 
-class _Keeper:
-    """Keeps the fetches of rays that are marched some at a time, as long as they fit into `most` bytes."""
+@dataclass(frozen=True)
+class Keeping:
+    """Limits on the fetches of all training rays that are kept."""
 
-    def __init__(self, most: int) -> None:
+    n_bytes: int
+    """Bytes that they may take."""
+    seconds: float
+    """Seconds that it may take to find them all. In fog, where a ray has hundreds of samples, it would take
+    longer than to find those of the rays that the steps draw."""
+
+
+class _Keeper:
+    """Keeps the fetches of rays that are marched in `n_batches` batches, as long as they are within
+    limits."""
+
+    def __init__(self, limits: Keeping, n_batches: int) -> None:
         # Memory pages are only taken for the fetches that there are.
-        self._points = np.empty((most // KEPT_BYTES, 3), np.float32)
-        self._numbers = np.empty(most // KEPT_BYTES, np.float32)
+        self._points = np.empty((limits.n_bytes // KEPT_BYTES, 3), np.float32)
+        self._numbers = np.empty(limits.n_bytes // KEPT_BYTES, np.float32)
         self._counts, self._opacity, self._n = list[np.ndarray](), list[np.ndarray](), 0
+        self._limits, self._n_batches = limits, n_batches
+        self._begun = 0.0
 
     def keep(self, found: PlayerFetches, numbers: np.ndarray) -> bool:
-        """Keep the fetches of some rays, and their lengths or weights in `numbers`. Return whether they still
-        fit."""
+        """Keep the fetches of a batch of rays, and their lengths or weights in `numbers`. Return whether all
+        are expected to be within the limits."""
         end = self._n + len(numbers)
         if end > len(self._numbers):
             return False
@@ -235,6 +252,14 @@ class _Keeper:
         self._counts.append(found.counts)
         self._opacity.append(found.opacity)
         self._n = end
+        n_kept = len(self._counts)
+        if n_kept == 1:
+            self._begun = time.monotonic()  # code may be compiled for the first batch
+        elif n_kept == N_PROBED:
+            seconds = (time.monotonic() - self._begun) * self._n_batches / (N_PROBED - 1)
+            # Batches of other views may have fewer fetches.
+            few = self._n * self._n_batches < 2 * N_PROBED * len(self._numbers)
+            return few and seconds <= self._limits.seconds
         return True
 
     def kept(self) -> KeptFetches:
@@ -297,7 +322,7 @@ def collect_training_rays(
     grid: SparseGrid,
     n_fetches: int,
     densities: VertexRows | None = None,
-    most_kept: int = 0,
+    keeping: Keeping | None = None,
 ) -> TrainingRays:
     """Select those of the teacher's rays that meet something in the grid.
 
@@ -306,12 +331,12 @@ def collect_training_rays(
         grid: the baked grid, as the player has it.
         n_fetches: feature lookups of a ray (the player's k), 0 for every sample.
         densities: rows of the stored densities, if they are trained too; this needs `n_fetches` = 0.
-        most_kept: bytes that the fetches of all rays may take; if they take more, they are not kept.
+        keeping: limits within which the fetches of all rays are kept; None if they are not to be kept.
 
     Raises TrainingError if no ray meets anything.
     """
     meets = np.zeros(len(teacher.opacity), bool)
-    keeper = _Keeper(most_kept) if most_kept else None
+    keeper = None if keeping is None else _Keeper(keeping, -(-len(meets) // RAYS_AT_ONCE))
     for first in range(0, len(meets), RAYS_AT_ONCE):
         rows = slice(first, first + RAYS_AT_ONCE)
         rays = teacher.rays_o[rows], teacher.rays_d[rows]

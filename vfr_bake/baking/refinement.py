@@ -27,7 +27,7 @@ from player.asset.density import decode_constants
 from player.asset.grid import SparseGrid
 from player.march.march import MAX_TAU
 from player.progress import Progress
-from vfr_bake.baking.distillation import TeacherRays, TrainingRays, collect_training_rays
+from vfr_bake.baking.distillation import Keeping, TeacherRays, TrainingRays, collect_training_rays
 from vfr_bake.baking.grids import Layout, Parts, move_towards, whole_codes, with_remainders
 from vfr_bake.baking.head import FoldedHead, between, runner, small_head
 from vfr_bake.baking.held_out import HeldOut, Stage
@@ -74,6 +74,9 @@ half of the time, because densities stay and a ray has fewer fetches, and teach 
 (docs/notes/2026-11-30-a-round-with-the-lookups-that-are-played.md)."""
 N_HEAD = 1_000_000
 """Rays on which a head is trained alone; their composites are computed once."""
+KEEPING_SHARE = 1 / 3
+"""Largest share of a round's time that it may take to find the fetches of all training rays, which are then
+kept. For more, there are too few steps for it to pay."""
 SHARES = {"small head": 0.2, "refinement": 0.7, "refinement at k": 1.0}
 """Share of the remaining time that each round may take."""
 DIRECTION_SHARE = 0.1
@@ -166,7 +169,7 @@ class Tuning:
         head_rate, code_rate = HEAD_RATE, CODE_RATE * choice.code_levels / 127
         before = self._held_out.stages[-1]
         densities = grid.rows if layout.densities is layout.features else layout.densities.rows()
-        rays = collect_training_rays(teacher, grid, 0, densities, self._most_kept)
+        rays = collect_training_rays(teacher, grid, 0, densities, self._keeping("refinement"))
         if choice.head_width:
             stored = replace(stored, head=self._new_head(stored.head, rays.typical(stored.features)))
             with self._steps("small head", head_steps(choice)) as steps:
@@ -223,7 +226,8 @@ class Tuning:
     ) -> Stored:
         """Refine head and features with the lookups and bits that are played, and keep the result if it gains
         anything. Changes the features of `stored` in place."""
-        rays = collect_training_rays(teacher, grid, self.n_fetches, most_kept=self._most_kept)
+        keeping = self._keeping("refinement at k")
+        rays = collect_training_rays(teacher, grid, self.n_fetches, keeping=keeping)
         asked = steps_at_k(refined_steps(self._config, self._choice, len(rays)))
         left = stored.features.astype(np.int8)  # the low bytes, which `whole_codes` rounds away
         with self._steps("refinement at k", asked) as steps:
@@ -244,13 +248,20 @@ class Tuning:
     def _steps(self, name: str, asked: int) -> Iterator[Steps]:
         """Give the steps of round `name`, up to `asked`, within its share of the remaining time. Afterwards,
         note the steps that were left out."""
-        seconds = SHARES[name] * (self._until - time.monotonic())
-        yield (steps := Steps(asked, partial(self._report, name), seconds))
+        yield (steps := Steps(asked, partial(self._report, name), self._seconds(name)))
         self._until += steps.paused
         if steps.n < asked:
             self.left_out[f"steps of {name!r}"] = (
                 f"{asked - steps.n:,} of {asked:,}: they would take too long"
             )
+
+    def _seconds(self, name: str) -> float:
+        """Return the seconds that round `name` may take."""
+        return SHARES[name] * (self._until - time.monotonic())
+
+    def _keeping(self, name: str) -> Keeping:
+        """Return the limits within which round `name` keeps the fetches of its rays."""
+        return Keeping(self._most_kept, KEEPING_SHARE * self._seconds(name))
 
     def _gained(self, name: str, before: Stage, after: Stage) -> bool:
         """Return whether less is lost than before, on pixels that nothing is trained on; if not, note that

@@ -7,6 +7,8 @@ import tracemalloc
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,8 +19,9 @@ from player.errors import TrainingError
 from player.progress import silent
 from player.render import Renderer
 from tests.numerics.fog import FEATURE, fog
+from vfr_bake.baking import distillation
 from vfr_bake.baking.bake import bake
-from vfr_bake.baking.distillation import TeacherRays, collect_training_rays, photographed_rays
+from vfr_bake.baking.distillation import Keeping, TeacherRays, collect_training_rays, photographed_rays
 from vfr_bake.baking.grids import latent
 from vfr_bake.config import BakeConfig
 from vfr_bake.data.view_pixels import ViewPixels
@@ -81,7 +84,7 @@ def test_kept_fetches_are_those_that_are_found_anew(n_fetches: int, monkeypatch:
     densities = None if n_fetches else grid.rows
     names = ["starts", "weights", "opacity"] if n_fetches else ["starts", "lengths"]
     collect = partial(collect_training_rays, rays, grid, n_fetches, densities)
-    anew, kept, some = collect(), collect(10**6), np.array([2, 0, 1, 1])
+    anew, kept, some = collect(), collect(Keeping(10**6, 1e9)), np.array([2, 0, 1, 1])
     assert anew.kept is None and kept.kept is not None
     assert np.array_equal(kept.teacher.rays_o, anew.teacher.rays_o)
     n = len(kept.kept.numbers)
@@ -92,9 +95,30 @@ def test_kept_fetches_are_those_that_are_found_anew(n_fetches: int, monkeypatch:
     for name in ("features", "densities"):
         for a, b in zip(getattr(found, name), getattr(expected, name), strict=True):
             assert np.array_equal(a, b)
-    few = collect(16 * n - 1)
+    few = collect(Keeping(16 * n - 1, 1e9))
     assert few.kept is None and len(few) == 3
     assert kept.some(2).kept is None
+
+
+@pytest.mark.parametrize(("n_bytes", "seconds"), [(10**7, 49.0), (10**7, 51.0), (10**4, 1e9)])
+def test_fetches_are_not_kept_where_that_takes_too_long_or_too_much(
+    n_bytes: int, seconds: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whether 50 batches, each of which takes a second, are kept is judged after the first eight of them."""
+    now = 0.0
+
+    def player_fetches(*given: Any) -> Any:
+        nonlocal now
+        now += 1 if now else 100  # the first batch compiles code
+        return found(*given)
+
+    found = distillation.player_fetches
+    monkeypatch.setattr(distillation, "RAYS_AT_ONCE", 1)
+    monkeypatch.setattr(distillation, "time", SimpleNamespace(monotonic=lambda: now))
+    monkeypatch.setattr(distillation, "player_fetches", player_fetches)
+    rays = collect_training_rays(teacher_rays([ALONG] * 50), fog(0.1), 0, None, Keeping(n_bytes, seconds))
+    assert (rays.kept is not None) == (seconds == 51) and len(rays) == 50
+    assert now == 99 + (50 if seconds == 51 else 8)
 
 
 def test_the_samples_of_all_rays_are_not_held(monkeypatch: pytest.MonkeyPatch) -> None:
