@@ -27,8 +27,8 @@ from player.files.files import check_target, write_bytes
 TRAIN_MINUTES = 2.25
 """Default training time in minutes, compiling included: two cores with AVX2 reach 34 dB in it."""
 REFINE_STEPS = 600
-"""Steps of each round of refinement, a compromise between 500 and 1,000: with 1,000 the loss is 0.1 dB less
-here, and the bake takes a quarter of a minute longer with AVX-512."""
+"""Steps of the first round of refinement, a compromise between 500 and 1,000: with 1,000 the loss is 0.1 dB
+less here, and the bake takes a quarter of a minute longer with AVX-512."""
 N_SHOWN = 4
 """Number of test views in the side-by-side picture."""
 
