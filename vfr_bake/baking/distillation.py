@@ -67,8 +67,8 @@ class Fetches(NamedTuple):
     weights: np.ndarray
     """[n_fetches] float32 compositing weights."""
     lengths: np.ndarray
-    """[n_fetches] float32 length of the piece of ray that a sample stands for, model units; empty if
-    densities are not trained and fetches are kept."""
+    """[n_fetches] float32 length of the piece of ray that a sample stands for, model units; 0 if several
+    samples were merged into the fetch. Empty if densities are not trained and fetches are kept."""
     opacity: np.ndarray
     """[n] float32 opacity of the baked grid."""
 
