@@ -25,6 +25,11 @@ DOCUMENTS = ("README.md", "docs/bake.md", "docs/benchmarks.md", "docs/trade.md")
 BLOCK = re.compile(r"(<!-- benchmarks: ([\w-]+) -->\n).*?(<!-- /benchmarks -->)", re.DOTALL)
 
 
+def merged(results: Results, second: Results) -> Results:
+    """Return the parts of both files; those of `second` stand in for those that `results` lacks."""
+    return results | {name: part for name, part in second.items() if name not in results}
+
+
 def rendered(text: str, results: Results, second: Results) -> str:
     """Return a document with its blocks made anew. Raises KeyError for an unknown block.
 
@@ -32,7 +37,7 @@ def rendered(text: str, results: Results, second: Results) -> str:
     that `results` lacks.
     """
     results, second = lettered(results, second)
-    whole = results | {name: part for name, part in second.items() if name not in results}
+    whole = merged(results, second)
 
     def block(found: re.Match[str]) -> str:
         name = found[2]
@@ -53,7 +58,7 @@ def rendered_files(results: Results, second: Results) -> dict[Path, bytes]:
     for name in DOCUMENTS:
         path = REPOSITORY / name
         files[path] = rendered(path.read_text(encoding="utf-8"), results, second).encode()
-    for name, picture in plots(results).items():
+    for name, picture in plots(merged(results, second)).items():
         files[REPOSITORY / "docs" / name] = picture.encode()
     return files
 

@@ -382,13 +382,19 @@ def specks(results: Results) -> list[str]:
 
 
 def expect(results: Results) -> list[str]:
-    """Return the README's table: lego's training, and two presets' time, bytes, loss and frame rates."""
+    """Return the README's table: lego's training, and two presets' time, bytes, loss and frame rates, with
+    the machine of each row if there are several."""
+
+    def letters(*names: str) -> str:
+        return ", ".join(machines({name: results[name] for name in names if name in results}))
+
     rows, lacking = [], present(results, ["train_lego", "eval_lego"])[1]
     if not lacking:
         trained, score = results["train_lego"]["figures"], results["eval_lego"]["figures"]
         took = f"{trained['seconds'] / 60:.1f} minutes"
-        found = f"{score['psnr']:.2f} dB mean PSNR on all {score['n_views']} test views"
-        rows.append(["`vfr-train --minutes 9.25`", f"{took}, {found}"])
+        psnr = give_or_take(score["psnr"], score["psnr_uncertainty"], 2)
+        found = f"{took}, {psnr} dB mean PSNR on all {score['n_views']} test views"
+        rows.append(["`vfr-train --minutes 9.25`", found, letters("train_lego", "eval_lego")])
     for preset in ("balanced", "fast"):
         names = [f"{what}_lego_{preset}" for what in ("bake", "play", "page")]
         there, missed = present(results, names)
@@ -399,19 +405,28 @@ def expect(results: Results) -> list[str]:
             if "page" in figures:
                 size += f"; as a page {figures['page']['n_bytes'] / 1e6:.1f} MB"
             lost = give_or_take(baked["loss_db"], baked["loss_db_spread"], 2)
-            rows.append([f"`vfr-bake --preset {preset}`", f"{size}; loses {lost} dB against photographs"])
+            told = f"{size}; loses {lost} dB against photographs"
+            rows.append([f"`vfr-bake --preset {preset}`", told, letters(names[0], names[2])])
         if played := figures.get("play"):
-            ms = {row["quality"]: row["ms"] for row in played["rows"] if row["march"] == "numba"}
-            rates = ", ".join(f"{quality} {number(1000 / ms[quality], 1)}" for quality in QUALITIES)
+            some = {row["quality"]: row for row in played["rows"] if row["march"] == "numba"}
+            rates = ", ".join(f"{q} {rate(some[q]['ms'], some[q]['uncertainty'])}" for q in QUALITIES)
             size = "x".join(map(str, played["size"]))
             told = f"`vfr-play` of it at {size}, frames a second by `--quality`"
-            rows.append([f"{told}, moving between training views and turning around the scene", rates])
+            told += ", moving between training views and turning around the scene"
+            rows.append([told, rates, letters(names[1])])
     if not rows:
         return missing(lacking)[1:]
-    machine = next(iter(results.values()))["machine"]
-    on = f"{machine['cores']} cores ({machine['processor']})"
-    table_lines = titled(["what", "figure"], rows, lacking)
-    return [f"Lego of NeRF-synthetic at 400x400, no GPU, on {on}:", "", *table_lines]
+    shown = {letter for row in rows for letter in row[2].split(", ")}
+    on = {
+        letter: f"{machine['cores']} cores ({machine['processor']})"
+        for letter, machine in machines(results).items()
+        if letter in shown
+    }
+    told = "; ".join(f"{letter}: {place}" for letter, place in on.items())
+    titles = ["what", "figure", "machine"]
+    if len(on) == 1:
+        told, titles, rows = on[rows[0][2]], titles[:2], [row[:2] for row in rows]
+    return [f"Lego of NeRF-synthetic at 400x400, no GPU, on {told}:", "", *titled(titles, rows, lacking)]
 
 
 BLOCKS: dict[str, Block] = {

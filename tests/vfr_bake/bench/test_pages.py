@@ -7,7 +7,7 @@ from xml.etree import ElementTree
 
 from tests.benchmarks.pages.beside import beside
 from tests.benchmarks.pages.cells import lettered, where
-from tests.benchmarks.pages.documents import BLOCKS, rendered
+from tests.benchmarks.pages.documents import BLOCKS, rendered, rendered_files
 from tests.benchmarks.pages.plots import plots
 from tests.benchmarks.suite.played import LOOKUPS
 from tests.benchmarks.suite.results import KEYS
@@ -193,32 +193,56 @@ def test_a_part_that_the_first_file_lacks_is_of_the_second() -> None:
     assert "| A, 0a1b2c3 |" in rendered(text, {"compositing_lego": result(found)}, other)
 
 
-def test_the_readme_tells_what_the_parts_found() -> None:
+def readme_results(**conditions: Any) -> dict[str, dict[str, Any]]:
+    """Return results for the README's table, without those of the preset `fast`."""
     baked = {"seconds": 192.0, "n_bytes": 4.94e6, "loss_db": 0.104, "loss_db_spread": 0.04}
     rows = [
-        {"march": march, "quality": quality, "ms": ms}
+        {"march": march, "quality": quality, "ms": ms, "uncertainty": 0.01 * ms}
         for march, factor in (("numpy", 10), ("numba", 1))
         for quality, ms in (("exact", 90 * factor), ("high", 50 * factor), ("fast", 40 * factor))
     ]
-    results = {
-        "train_lego": result({"seconds": 570.0}),
-        "eval_lego": result({"psnr": 32.234, "n_views": 200}),
-        "bake_lego_balanced": result(baked),
-        "play_lego_balanced": result({"size": [800, 800], "rows": rows}),
-        "page_lego_balanced": result({"n_bytes": 5.2e6}),
+    figures: dict[str, dict[str, Any]] = {
+        "train_lego": {"seconds": 570.0},
+        "eval_lego": {"psnr": 32.234, "psnr_uncertainty": 0.21, "n_views": 200},
+        "bake_lego_balanced": baked,
+        "play_lego_balanced": {"size": [800, 800], "rows": rows},
+        "page_lego_balanced": {"n_bytes": 5.2e6},
     }
-    lines = BLOCKS["expect"](results)
+    return {name: result(some, **conditions) for name, some in figures.items()}
+
+
+def test_the_readme_tells_what_the_parts_found() -> None:
+    lines = BLOCKS["expect"](readme_results())
     assert lines[0] == "Lego of NeRF-synthetic at 400x400, no GPU, on 2 cores (one):"
     told = [line.split(" | ")[1].removesuffix(" |") for line in lines[4:7]]
     assert "at 800x800, frames a second by `--quality`, moving between training views" in lines[6]
     assert told == [
-        "9.5 minutes, 32.23 dB mean PSNR on all 200 test views",
+        "9.5 minutes, 32.23 ± 0.21 dB mean PSNR on all 200 test views",
         "3.2 minutes, 4.9 MB; as a page 5.2 MB; loses 0.10 ± 0.04 dB against photographs",
-        "exact 11.1, high 20.0, fast 25.0",
+        "exact 11.1 ± 0.1, high 20.0 ± 0.2, fast 25.0 ± 0.2",
     ]
     lacking = "bake_lego_fast, play_lego_fast, page_lego_fast"
     assert lines[7:] == ["", f"Not measured yet: {lacking} (`make benchmarks`)."]
     assert BLOCKS["expect"]({})[0].startswith("Not measured yet: train_lego, eval_lego, bake_lego_balanced")
+
+
+def test_the_readme_names_the_machine_that_the_figures_are_of() -> None:
+    """A file of results may begin with a part that the README does not show, of a machine that it does not
+    name."""
+    text, another = "<!-- benchmarks: expect -->\n<!-- /benchmarks -->", MACHINE | {"processor": "another"}
+    found = rendered(text, {"compiled": result({})}, readme_results(machine=another)).splitlines()
+    assert found[2] == "Lego of NeRF-synthetic at 400x400, no GPU, on 2 cores (another):"
+    assert found[4] == "| what | figure |"
+    first = {name: part for name, part in readme_results().items() if name != "play_lego_balanced"}
+    found = rendered(text, first, readme_results(machine=another)).splitlines()
+    assert found[2].endswith("no GPU, on A: 2 cores (one); B: 2 cores (another):")
+    assert found[4] == "| what | figure | machine |"
+    assert [line.split(" | ")[2] for line in found[6:9]] == ["A |", "A |", "B |"]
+
+
+def test_a_plot_is_drawn_of_the_file_that_its_table_is_of() -> None:
+    files = rendered_files({"trade_lego": TRADE}, {"trade_can": TRADE})
+    assert {path.name for path in files if path.suffix == ".svg"} == {"trade_lego.svg", "trade_can.svg"}
 
 
 def test_cameras_are_told_by_stage() -> None:
