@@ -1,8 +1,7 @@
-"""Read picture files, turn them upright, undo lens distortion, and reduce them."""
+"""Read picture files, turn them upright, and undo lens distortion."""
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,7 +12,6 @@ from player.cameras.camera import Camera
 from player.errors import DataError, FormatError, MissingExtraError
 from player.files.files import open_file, read_bytes
 from player.files.images import BAND, MAX_FILE_BYTES
-from vfr_bake.data.capture import PosedImages
 from vfr_bake.data.files.opening import open_photograph
 from vfr_bake.data.files.orientation import PictureHeader, as_stored, layout_of, read_layout, turned_upright
 from vfr_bake.data.files.profiles import as_srgb, coded_profile
@@ -62,35 +60,6 @@ def picture_layout(path: Path) -> PictureHeader:
         return read_layout(path)
     except FormatError as error:
         raise DataError(str(error)) from error
-
-
-def reduced(views: PosedImages, factor: int) -> PosedImages:
-    """Return the views with pixels `factor` times as large along each side, each the mean of those it
-    replaces.
-
-    Rows and columns that do not fill a pixel are cut off at the right and below. Raises DataError if nothing
-    would be left.
-    """
-    if factor == 1:
-        return views
-    cameras, images = [], []
-    for camera, image in zip(views.cameras, views.images, strict=True):
-        height, width = image.shape[0] // factor, image.shape[1] // factor
-        if min(height, width) < 1:
-            raise DataError(
-                f"{camera.name}: downscale: expected at most {min(image.shape[:2])}, got {factor}"
-            )
-        images.append(_reduced(image[: height * factor, : width * factor], factor))
-        cut = replace(camera, width=width * factor, height=height * factor)
-        cameras.append(cut.resized(width, height))
-    return PosedImages(cameras, images)
-
-
-def _reduced(image: np.ndarray, factor: int) -> np.ndarray:
-    if (image[..., 3] == 255).all():
-        return np.asarray(Image.fromarray(image).reduce(factor))
-    height, width = image.shape[0] // factor, image.shape[1] // factor
-    return straight(premultiplied(image).reshape(height, factor, width, factor, 4).mean(axis=(1, 3)))
 
 
 def premultiplied(image: np.ndarray) -> np.ndarray:

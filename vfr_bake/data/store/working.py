@@ -9,8 +9,10 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from PIL import Image
 
 from player.cameras.camera import Camera
+from player.errors import DataError
 from vfr_bake.data.capture import PosedImages
 from vfr_bake.data.files.masks import apply_mask
 from vfr_bake.data.files.pictures import (
@@ -20,7 +22,6 @@ from vfr_bake.data.files.pictures import (
     opencv,
     premultiplied,
     read_picture,
-    reduced,
     straight,
     undistort,
     viewed_size,
@@ -102,6 +103,35 @@ class WorkingSize:
 
     def _whole_step(self, longest: int) -> int:
         return 1 if self.max_side is None else max(1, longest // self.max_side)
+
+
+def reduced(views: PosedImages, factor: int) -> PosedImages:
+    """Return the views with pixels `factor` times as large along each side, each the mean of those it
+    replaces.
+
+    Rows and columns that do not fill a pixel are cut off at the right and below. Raises DataError if nothing
+    would be left.
+    """
+    if factor == 1:
+        return views
+    cameras, images = [], []
+    for camera, image in zip(views.cameras, views.images, strict=True):
+        height, width = image.shape[0] // factor, image.shape[1] // factor
+        if min(height, width) < 1:
+            raise DataError(
+                f"{camera.name}: downscale: expected at most {min(image.shape[:2])}, got {factor}"
+            )
+        images.append(_reduced(image[: height * factor, : width * factor], factor))
+        cut = replace(camera, width=width * factor, height=height * factor)
+        cameras.append(cut.resized(width, height))
+    return PosedImages(cameras, images)
+
+
+def _reduced(image: np.ndarray, factor: int) -> np.ndarray:
+    if (image[..., 3] == 255).all():
+        return np.asarray(Image.fromarray(image).reduce(factor))
+    height, width = image.shape[0] // factor, image.shape[1] // factor
+    return straight(premultiplied(image).reshape(height, factor, width, factor, 4).mean(axis=(1, 3)))
 
 
 def resized(camera: Camera, image: np.ndarray, width: int, height: int) -> tuple[Camera, np.ndarray]:
