@@ -103,7 +103,9 @@ class PlaySettings:
     """Gigabytes that the asset may take on a worker of a cluster; half of its machine's if None."""
 
     def __post_init__(self) -> None:
-        from player.render import Quality, check_choice, checked_background, checked_samples
+        from player.files.memory import allowed_bytes
+        from player.render import March, Quality, check_choice, checked_background, checked_samples
+        from player.threads import bounded_threads
 
         object.__setattr__(self, "fps", _frame_rate(self.fps))
         if self.samples is not None:
@@ -111,8 +113,18 @@ class PlaySettings:
         if self.background is not None:
             object.__setattr__(self, "background", checked_background(self.background))
         check_choice("quality", self.quality, get_args(Quality))
+        check_choice("march", self.march, get_args(March))
         if self.format is not None:
             check_choice("format", self.format, ("png", "webp"))
+        if self.frames is not None:
+            _check_slice(self.frames)
+        for name in ("resume", "force"):
+            if not isinstance(value := getattr(self, name), bool):
+                raise ConfigError(f"{name}: expected True or False, got {brief(value)}")
+        if self.threads is not None:
+            bounded_threads(self.threads)
+        if self.max_memory is not None:
+            allowed_bytes(self.max_memory)
         output = Path(self.output)
         suffix = output.suffix.lower()
         if self.resume and self.force:
@@ -126,6 +138,15 @@ class PlaySettings:
             raise ConfigError(f"--format: {output.name} says which format it is")
         if self.background == "transparent" and suffix == VIDEO:
             raise ConfigError("--background: a video has no transparency")
+
+
+def _check_slice(frames: Any) -> None:
+    try:
+        slice.indices(frames, 0)
+    except (TypeError, ValueError):
+        raise ConfigError(
+            f"frames: expected a slice of whole numbers, such as slice(10, 20), got {brief(frames)}"
+        ) from None
 
 
 def _frame_rate(value: Any) -> float:

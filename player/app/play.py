@@ -70,8 +70,9 @@ def play(
             milliseconds that this one took.
 
     Raises:
-        ConfigError: no camera is chosen, a picture is too large, or too large for its format, sizes differ in
-            a video, or a resumed run finds pictures or a video that show something else.
+        ConfigError: `cameras` is one camera or an empty list, none of them is chosen, a picture is too
+            large, or too large for its format, sizes differ in a video, or a resumed run finds pictures or a
+            video that show something else.
         MissingExtraError: a video without PyAV, a cluster without dask.distributed, or numba where it is
             asked for and does not run.
         OutputError: a file exists already, or cannot be written.
@@ -87,6 +88,10 @@ def play(
     >>> played.figures["frames"], sorted(path.name for path in Path("turn").iterdir())
     (3, ['orbit_000.png', 'orbit_001.png', 'orbit_002.png'])
     """
+    if isinstance(cameras, Camera):
+        raise ConfigError("cameras: expected a list of cameras, got one: write [camera]")
+    if not len(cameras):
+        raise ConfigError("cameras: expected at least one, got none")
     target = Target.of(settings)
     target.check(settings)
     part = settings.frames or slice(None)

@@ -5,9 +5,11 @@ from __future__ import annotations
 import os
 import sys
 from contextlib import suppress
+from numbers import Real
 from pathlib import Path
 
 from player.errors import ConfigError
+from player.files.json_files import brief
 
 SHARE = 0.5
 """The share of the machine's memory, or of a lower limit of the process, that is used where the user gives no
@@ -27,15 +29,15 @@ def allowed_bytes(max_memory: float | None = None) -> int:
     Args:
         max_memory: gigabytes that the user allows; None is a share (`SHARE`) of what this process can have.
 
-    Raises ConfigError: `max_memory` is not between 0 and 1e9.
+    Raises ConfigError: `max_memory` is no number between 0 and 1e9.
 
     >>> allowed_bytes(1.5)
     1500000000
     """
     if max_memory is None:
         return int(SHARE * available_bytes())
-    if not 0 < max_memory < 1e9:
-        raise ConfigError(f"max_memory: expected gigabytes, more than 0, got {max_memory:g}")
+    if not (isinstance(max_memory, Real) and 0 < max_memory < 1e9):
+        raise ConfigError(f"max_memory: expected gigabytes, more than 0, got {brief(max_memory)}")
     return int(max_memory * 1e9)
 
 

@@ -13,7 +13,6 @@ import time
 import weakref
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -99,29 +98,6 @@ def test_a_program_plays_as_the_command_does(
         play(asset, asset_cameras(asset), settings)
     played = play(asset, asset_cameras(asset), replace(settings, output=f"{here}/", resume=True))
     assert (played.n_kept, played.figures["frames"]) == (2, 0)
-
-
-@pytest.mark.parametrize(
-    ("output", "settings", "message"),
-    [
-        ("a", {"resume": True, "force": True}, "--resume: not allowed with --force"),
-        ("a.png", {"format": "webp"}, "--format: a.png says which format it is"),
-        ("a.MP4", {"background": "transparent"}, "--background: a video has no transparency"),
-        ("a", {"samples": 2.5}, "samples: expected 0 .all. or more, a whole number, got 2.5"),
-        ("a", {"quality": "best"}, "quality: expected exact, high or fast, got best"),
-        ("a", {"format": "jpg"}, "format: expected png or webp, got jpg"),
-        ("a", {"background": np.ones(2)}, "background: expected three numbers in 0"),
-        ("a", {"background": "white"}, "background: expected three numbers in 0"),
-        *(
-            ("a.mp4", {"fps": fps}, "--fps: expected 0.001 to 1000 frames a second, got ")
-            for fps in (0, 0.0009, 1001, -30, math.nan, math.inf, None, "fast")
-        ),
-    ],
-)
-def test_settings_that_cannot_be(output: str, settings: dict[str, Any], message: str) -> None:
-    for named in (Path(output), output):
-        with pytest.raises(ConfigError, match=message):
-            PlaySettings(named, **settings)
 
 
 @pytest.mark.parametrize("name", ["frames", pytest.param("turn.mp4", marks=pytest.mark.extra)])
