@@ -169,7 +169,9 @@ class Tuning:
         head_rate, code_rate = HEAD_RATE, CODE_RATE * choice.code_levels / 127
         before = self._held_out.stages[-1]
         densities = grid.rows if layout.densities is layout.features else layout.densities.rows()
-        rays = collect_training_rays(teacher, grid, 0, densities, self._keeping("refinement"))
+        asked = refined_steps(self._config, choice, len(teacher.opacity))
+        keeping = self._keeping("refinement", asked, teacher)
+        rays = collect_training_rays(teacher, grid, 0, densities, keeping)
         if choice.head_width:
             stored = replace(stored, head=self._new_head(stored.head, rays.typical(stored.features)))
             with self._steps("small head", head_steps(choice)) as steps:
@@ -226,7 +228,8 @@ class Tuning:
     ) -> Stored:
         """Refine head and features with the lookups and bits that are played, and keep the result if it gains
         anything. Changes the features of `stored` in place."""
-        keeping = self._keeping("refinement at k")
+        asked = steps_at_k(refined_steps(self._config, self._choice, len(teacher.opacity)))
+        keeping = self._keeping("refinement at k", asked, teacher)
         rays = collect_training_rays(teacher, grid, self.n_fetches, keeping=keeping)
         asked = steps_at_k(refined_steps(self._config, self._choice, len(rays)))
         left = stored.features.astype(np.int8)  # the low bytes, which `whole_codes` rounds away
@@ -259,8 +262,11 @@ class Tuning:
         """Return the seconds that round `name` may take."""
         return SHARES[name] * (self._until - time.monotonic())
 
-    def _keeping(self, name: str) -> Keeping:
-        """Return the limits within which round `name` keeps the fetches of its rays."""
+    def _keeping(self, name: str, n_steps: int, teacher: TeacherRays) -> Keeping | None:
+        """Return the limits within which round `name`, of at most `n_steps` steps, keeps the fetches of the
+        teacher's rays; None if its steps draw fewer rays than there are."""
+        if n_steps * BATCH < len(teacher.opacity):
+            return None
         return Keeping(self._most_kept, KEEPING_SHARE * self._seconds(name))
 
     def _gained(self, name: str, before: Stage, after: Stage) -> bool:

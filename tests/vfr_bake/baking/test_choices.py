@@ -16,7 +16,7 @@ from tests.vfr_bake.baking.scenes import analytic_scene, trained
 from vfr_bake.baking import refinement
 from vfr_bake.baking.bake import _Bake, bake
 from vfr_bake.baking.detail.detail import Detail
-from vfr_bake.baking.distillation import render_teacher
+from vfr_bake.baking.distillation import TeacherRays, render_teacher
 from vfr_bake.baking.held_out import Shown
 from vfr_bake.config import BakeConfig, FieldOptions, TrainConfig
 from vfr_bake.presets import PRESETS
@@ -106,6 +106,13 @@ def test_a_pause_in_a_round_takes_no_time_from_the_next(monkeypatch: pytest.Monk
             now += 3600 if step == 500 else 0  # the machine sleeps
     assert not tuning.left_out
     assert tuning._until - now == pytest.approx(100 - 999 / 2**6 - LONGEST_STEP)
+
+
+@pytest.mark.parametrize(("n_steps", "are_kept"), [(2, False), (3, True)])
+def test_fetches_are_kept_where_steps_draw_more_rays_than_there_are(n_steps: int, are_kept: bool) -> None:
+    teacher = TeacherRays(*(np.zeros((10_000, *shape), np.float32) for shape in ((3,), (3,), (3,), ())))
+    tuning = refinement.Tuning(BakeConfig(), PRESETS["fast"], None, lambda *_: None, 100.0)  # type: ignore[arg-type]
+    assert (tuning._keeping("refinement", n_steps, teacher) is not None) == are_kept
 
 
 @pytest.mark.parametrize(("max_loss_db", "steps"), [(None, (1, 2, 4)), (0.5, (1, 2, 2)), (0.4, (1, 1, 1))])
