@@ -8,8 +8,8 @@
 
 When a part ends, its result is recorded in docs/benchmarks.json, or in docs/benchmarks_avx512.json if the
 processor has AVX-512, so that an interrupted run goes on where it was. Models and assets lie in
-build/benchmarks. Each part waits until the machine is quiet. Data sets lie in the folder that VFR_DATA names.
-Linux alone.
+build/benchmarks. Each part waits until the machine is quiet, and is measured once more if the machine does
+not stay so. Data sets lie in the folder that VFR_DATA names. Linux alone.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def main() -> int:
     parser.add_argument("--again", action="store_true", help="also run parts whose result is there")
     parser.add_argument("--wait", type=float, default=30, metavar="MINUTES", help="for a quiet machine; 30")
     parser.add_argument(
-        "--busy-anyway", action="store_true", help="after that, measure beside what else runs"
+        "--busy-anyway", action="store_true", help="after that, measure once, beside what else runs"
     )
     parser.add_argument("--quick", action="store_true", help=argparse.SUPPRESS)  # tries out the machinery
     arguments = parser.parse_args()
