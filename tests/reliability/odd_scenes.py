@@ -13,9 +13,9 @@ import numpy as np
 
 from player.cameras.camera import Camera
 from tests.vfr_bake.baking.scenes import chord, fog_and_wires
-from vfr_bake.data.capture import Capture, PosedImages, held_out
 from vfr_bake.data.demo import demo_cameras, demo_views
 from vfr_bake.data.demo_solids import CENTRE, SCALE
+from vfr_bake.data.store.capture import Capture, PosedImages, held_out
 
 Tracer = Callable[[np.ndarray, np.ndarray], np.ndarray]
 

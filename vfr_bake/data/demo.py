@@ -13,10 +13,10 @@ import numpy as np
 
 from player.cameras.camera import Camera
 from player.progress import Progress
-from vfr_bake.data.capture import Capture, PosedImages
 from vfr_bake.data.demo_shading import shade
 from vfr_bake.data.demo_solids import CENTRE, HIGH, LOW, SCALE, SOLIDS, enter, inverse
 from vfr_bake.data.scene import Scene, build_scene
+from vfr_bake.data.store.capture import Capture, PosedImages
 from vfr_bake.data.threads import in_threads
 
 _MAX_ROUNDS = 32

@@ -24,13 +24,13 @@ from player.cameras.transforms import load_transforms, transforms_cameras, trans
 from player.errors import DataError, FormatError
 from player.files.json_files import as_float, brief
 from player.progress import Progress
-from vfr_bake.data.capture import Capture, PosedImages, held_out
 from vfr_bake.data.files.estimate_record import read_record
 from vfr_bake.data.files.listing import find_pictures, other_kinds
 from vfr_bake.data.files.masks import is_file, mask_of, stray_masks
 from vfr_bake.data.files.opening import SUFFIXES, open_photograph
 from vfr_bake.data.files.orientation import is_taken_upright
 from vfr_bake.data.files.pictures import DescribedView, picture_layout, read_picture
+from vfr_bake.data.store.capture import Capture, PosedImages, held_out
 from vfr_bake.data.store.reading import PictureReader
 
 DISTORTION_KEYS = ("k1", "k2", "k3", "k4", "p1", "p2")

@@ -16,8 +16,8 @@ from player.cameras.camera import Camera, focus_point
 from player.errors import DataError
 from vfr_bake.config import SceneKind
 from vfr_bake.data.bounds import scene_box
-from vfr_bake.data.capture import Capture, PosedImages
 from vfr_bake.data.files.masks import check_masked
+from vfr_bake.data.store.capture import Capture, PosedImages
 from vfr_bake.data.world import MOST_POINTS
 
 BORDER = 2

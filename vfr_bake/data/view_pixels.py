@@ -11,7 +11,7 @@ import numpy as np
 
 from player.cameras.camera import Camera
 from player.march.pixels import rays_of_pixels
-from vfr_bake.data.capture import PosedImages
+from vfr_bake.data.store.capture import PosedImages
 
 N_TRAINING_PIXELS = 4_000_000
 """Number of training pixels at most: 32 MB of a model file."""

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from player.cameras.camera import Camera
-from vfr_bake.data.capture import PosedImages
+from vfr_bake.data.store.capture import PosedImages
 from vfr_bake.data.view_pixels import ViewPixels, spread
 
 N_WITNESSES = 60_000

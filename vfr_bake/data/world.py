@@ -14,7 +14,7 @@ import numpy as np
 
 from player.cameras.camera import Camera
 from player.errors import DataError
-from vfr_bake.data.capture import Capture, PosedImages
+from vfr_bake.data.store.capture import Capture, PosedImages
 
 SIDEWAYS = 0.1
 """Sine of the angle by which the x axis of a camera that is held level may leave the horizontal plane. The x

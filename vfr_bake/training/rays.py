@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from player.errors import TrainingError
-from vfr_bake.data.capture import PosedImages
+from vfr_bake.data.store.capture import PosedImages
 from vfr_bake.data.store.stored import StoredImages
 from vfr_bake.data.witnesses import Witnesses
 from vfr_bake.training.detail import detail_lots

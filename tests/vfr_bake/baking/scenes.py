@@ -11,10 +11,10 @@ import torch
 
 from player.cameras.camera import Camera
 from vfr_bake.config import TrainConfig
-from vfr_bake.data.capture import Capture, PosedImages
 from vfr_bake.data.demo import demo_cameras
 from vfr_bake.data.demo_solids import CENTRE, SCALE
 from vfr_bake.data.scene import Scene, build_scene
+from vfr_bake.data.store.capture import Capture, PosedImages
 from vfr_bake.training.model_file import Model, trained_model
 from vfr_bake.training.trainer import Trainer
 

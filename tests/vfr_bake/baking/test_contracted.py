@@ -26,9 +26,9 @@ from vfr_bake.baking.cells import lattice_step, rays_of_contracted_views, weight
 from vfr_bake.baking.distillation import TeacherRays, TrainingRays, collect_training_rays
 from vfr_bake.baking.grids import unit_points
 from vfr_bake.config import BakeConfig, FieldOptions, TrainConfig
-from vfr_bake.data.capture import PosedImages
 from vfr_bake.data.demo import demo_capture
 from vfr_bake.data.scene import build_scene
+from vfr_bake.data.store.capture import PosedImages
 from vfr_bake.kernels.visibility import mark_weighty_cells
 from vfr_bake.rendering.compositing import composite
 from vfr_bake.rendering.render import render_image

@@ -12,9 +12,9 @@ from player.cameras.camera import Camera
 from player.errors import DataError, ShapeError
 from vfr_bake.config import SceneKind
 from vfr_bake.data.bounds import scene_box
-from vfr_bake.data.capture import Capture, PosedImages
 from vfr_bake.data.demo import demo_cameras, demo_views
 from vfr_bake.data.scene import NEAR_CAMERA, NEAR_QUANTILE, NEAR_SHARE, WHITE, _near, build_scene
+from vfr_bake.data.store.capture import Capture, PosedImages
 from vfr_bake.data.store.working import WorkingSize
 
 

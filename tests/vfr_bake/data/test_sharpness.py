@@ -7,9 +7,9 @@ import pytest
 from PIL import Image, ImageFilter
 
 from player.errors import ShapeError
-from vfr_bake.data.capture import PosedImages
 from vfr_bake.data.demo import demo_views
 from vfr_bake.data.quality.sharpness import FEWEST, SMALLEST, blur, blurred, without_blurred
+from vfr_bake.data.store.capture import PosedImages
 
 
 @pytest.fixture(scope="module")

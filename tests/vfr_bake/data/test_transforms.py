@@ -17,11 +17,11 @@ from player.cameras.camera import Camera
 from player.cameras.transforms import read_cameras
 from player.errors import DataError, FormatError, MissingExtraError
 from vfr_bake.data import load_scene
-from vfr_bake.data.capture import PosedImages
 from vfr_bake.data.demo import demo_cameras
 from vfr_bake.data.files.opening import SUFFIXES
 from vfr_bake.data.files.pictures import read_picture, undistort
 from vfr_bake.data.folders import _distortion
+from vfr_bake.data.store.capture import PosedImages
 from vfr_bake.data.store.reading import PictureReader
 
 

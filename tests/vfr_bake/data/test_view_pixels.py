@@ -9,7 +9,7 @@ import pytest
 from scipy.ndimage import binary_dilation
 
 from tests.vfr_bake.data.test_witnesses import numbered_views
-from vfr_bake.data.capture import PosedImages
+from vfr_bake.data.store.capture import PosedImages
 from vfr_bake.data.view_pixels import N_TRAINING_PIXELS, NEAR, choose_training_pixels
 from vfr_bake.data.witnesses import choose_witnesses
 

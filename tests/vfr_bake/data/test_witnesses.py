@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from vfr_bake.data.capture import PosedImages
 from vfr_bake.data.demo import demo_cameras
+from vfr_bake.data.store.capture import PosedImages
 from vfr_bake.data.witnesses import (
     MOST_OF_A_VIEW,
     N_WITNESSES,

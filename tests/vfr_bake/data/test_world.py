@@ -9,8 +9,8 @@ import pytest
 
 from player.errors import DataError
 from vfr_bake.data import check_scale, load_scene
-from vfr_bake.data.capture import Capture, PosedImages
 from vfr_bake.data.demo import demo_views
+from vfr_bake.data.store.capture import Capture, PosedImages
 from vfr_bake.data.store.reading import PictureReader
 from vfr_bake.data.world import find_up, scaled, turn_to_z
 

@@ -10,8 +10,8 @@ import pytest
 import torch
 
 from player.errors import TrainingError
-from vfr_bake.data.capture import PosedImages
 from vfr_bake.data.demo import demo_cameras
+from vfr_bake.data.store.capture import PosedImages
 from vfr_bake.data.witnesses import Witnesses
 from vfr_bake.training.detail import detail_lots
 from vfr_bake.training.rays import RUN, DevicePixelSampler, Lottery, PixelSampler, RayBatch

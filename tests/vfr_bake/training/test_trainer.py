@@ -18,10 +18,10 @@ from torch import distributed
 
 from player.errors import ConfigError, FormatError, TrainingError
 from vfr_bake.config import FieldOptions, SceneKind, TrainConfig
-from vfr_bake.data.capture import PosedImages
 from vfr_bake.data.demo import demo_capture, demo_scene
 from vfr_bake.data.scene import Scene, build_scene
 from vfr_bake.data.store import stored
+from vfr_bake.data.store.capture import PosedImages
 from vfr_bake.data.store.stored import StoreLayout, in_order, map_pictures, write_picture
 from vfr_bake.data.store.working import WorkingSize
 from vfr_bake.field.hash_grid import Backend

@@ -19,9 +19,9 @@ import numpy as np
 from player.cameras.camera import Camera
 from player.cameras.rotations import OPENGL_FROM_OPENCV
 from player.progress import Progress
-from vfr_bake.data.capture import PosedImages
 from vfr_bake.data.features import N_NEIGHBOURS, Features, find_features, match
 from vfr_bake.data.mapping import MIN_MATCHES, Pair, pycolmap_module, two_view_options
+from vfr_bake.data.store.capture import PosedImages
 from vfr_bake.data.threads import in_threads
 
 MIN_KEPT = 0.1

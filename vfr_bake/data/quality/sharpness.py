@@ -14,7 +14,7 @@ import numpy as np
 
 from player.errors import MissingExtraError, ShapeError
 from player.progress import Progress
-from vfr_bake.data.capture import PosedImages
+from vfr_bake.data.store.capture import PosedImages
 from vfr_bake.data.threads import in_threads
 
 SIDE = 512

@@ -1,2 +1,2 @@
-"""Pictures at the size at which they are trained on: held in memory if they are few, on the disk if they are
-many."""
+"""Posed pictures at the size at which they are trained on: held in memory if they are few, on the disk if
+they are many."""

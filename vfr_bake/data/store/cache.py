@@ -25,8 +25,8 @@ from player.errors import FormatError, OutputError
 from player.files.files import new_folder
 from player.files.json_files import parse_json, read_json
 from player.kept_code import user_folder
-from vfr_bake.data.capture import PosedImages
 from vfr_bake.data.files.pictures import DescribedView
+from vfr_bake.data.store.capture import PosedImages
 from vfr_bake.data.store.stored import StoreLayout, map_pictures
 from vfr_bake.data.store.working import WorkingSize
 

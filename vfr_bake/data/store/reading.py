@@ -20,9 +20,9 @@ from player.errors import OutputError
 from player.files.memory import allowed_bytes
 from player.files.replace import PART, held
 from player.progress import Progress
-from vfr_bake.data.capture import PosedImages
 from vfr_bake.data.files.pictures import DescribedView, viewed_size
 from vfr_bake.data.store import cache
+from vfr_bake.data.store.capture import PosedImages
 from vfr_bake.data.store.stored import StoreLayout, in_order, write_picture
 from vfr_bake.data.store.working import WorkingSize
 from vfr_bake.data.threads import in_threads, n_threads, one_by_one

@@ -13,7 +13,6 @@ from PIL import Image
 
 from player.cameras.camera import Camera
 from player.errors import DataError
-from vfr_bake.data.capture import PosedImages
 from vfr_bake.data.files.masks import apply_mask
 from vfr_bake.data.files.pictures import (
     BYTES_DECODED,
@@ -26,6 +25,7 @@ from vfr_bake.data.files.pictures import (
     undistort,
     viewed_size,
 )
+from vfr_bake.data.store.capture import PosedImages
 
 MAX_SIDE = 1600
 """Pixels of the longest side, if nothing else is asked for: a capture's field resolves no finer detail in the

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from player.progress import Progress
-from vfr_bake.data.capture import PosedImages
 from vfr_bake.data.scene import Scene, evenly
+from vfr_bake.data.store.capture import PosedImages
 from vfr_bake.data.view_pixels import ViewPixels
 from vfr_bake.rendering.render import render_camera, render_rays
 from vfr_bake.training.captures.picture_colours import fitted

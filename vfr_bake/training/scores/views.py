@@ -11,8 +11,8 @@ import numpy as np
 from player.cameras.camera import Camera
 from player.errors import DataError
 from player.terminal import printable
-from vfr_bake.data.capture import PosedImages
 from vfr_bake.data.scene import Scene
+from vfr_bake.data.store.capture import PosedImages
 
 APART = 1e-3
 """Largest distance of two cameras that count as one, in model units, and largest difference between numbers

@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 
 from vfr_bake.config import FieldOptions, TrainConfig
-from vfr_bake.data.capture import PosedImages
 from vfr_bake.data.demo import demo_capture
 from vfr_bake.data.demo_solids import CENTRE, SCALE
 from vfr_bake.data.scene import Scene, build_scene
+from vfr_bake.data.store.capture import PosedImages
 from vfr_bake.training.model_file import trained_model
 from vfr_bake.training.scores.evaluation import render_views
 from vfr_bake.training.trainer import Trainer

@@ -10,9 +10,9 @@ import pytest
 
 from player.errors import DataError
 from tests.vfr_bake.training.captures.altered import settings
-from vfr_bake.data.capture import PosedImages
 from vfr_bake.data.demo import demo_scene
 from vfr_bake.data.scene import Scene
+from vfr_bake.data.store.capture import PosedImages
 from vfr_bake.training.model_file import Model, trained_model
 from vfr_bake.training.scores.evaluation import quick_psnr, render_views
 from vfr_bake.training.scores.views import Learned, check_cameras, scored_views, seen_views
