@@ -25,12 +25,23 @@ from tests.benchmarks.suite.results import KEYS, RESULTS, RESULTS_AVX512, read_r
 from tests.benchmarks.suite.runner import Runner, Settings
 from tests.benchmarks.suite.work import Part, PartError, Work
 from tests.vfr_bake.bench.test_pages import MACHINE
+from vfr_bake.config import EFFORT_MINUTES, BenchConfig
 from vfr_bake.data.demo import demo_capture
 from vfr_bake.data.scene import build_scene
 
 REPOSITORY = Path(__file__).resolve().parent.parent
-MEASURED = re.compile(r"\d\s?(?:dB\b|[MG]B\b|ms\b|s\b|min\b|%|frames|fps|seconds|minutes|times)")
-"""Pattern of a number with a unit in which something is measured."""
+MEASURED = re.compile(
+    r"(?:\d[\s-]?|\b(?:one|two|three|four|five|six|seven|eight|nine|ten|eleven|twelve|half|quarter)"
+    r"(?: of)?(?: an?)?[\s-])(?:dB\b|decibels?\b|PSNR\b|[kMG]B\b|ms\b|s\b|min\b|h\b|%|x\b(?!\s?\d)|times|"
+    r"frames|fps|(?:milli)?seconds?\b|minutes?\b|hours?\b)"
+)
+"""Pattern of a number, in digits or in a word, with a unit in which something is measured."""
+LIMITS = {
+    "README.md": f"at most {max(EFFORT_MINUTES['good']):g} minutes",
+    "docs/benchmarks.md": f"at most {LONGEST_CORE:g} minutes",
+    "docs/trade.md": f"about {BenchConfig.minutes:g} minutes",
+}
+"""Pages on which no measured figure may be typed, and what each says of a limit that a program keeps."""
 
 
 # Documents ----------------------------------------------------------------------------------------
@@ -57,15 +68,23 @@ def test_every_block_is_shown_once_and_known() -> None:
 
 
 def measured_figures(text: str) -> list[str]:
-    """Return the figures outside the blocks, except those in commands and those published by others."""
+    """Return the figures outside the blocks, except those in commands and those published by others. What is
+    said behind a command counts."""
     outside = re.sub(r"### Published figures of other systems\n.*?\n## ", "", prose(text), flags=re.DOTALL)
-    outside = re.sub(r"```.*?```|`[^`]*`|\]\([^)]*\)", "", outside, flags=re.DOTALL)
-    return MEASURED.findall(outside)
+    outside = re.sub(
+        r"^```.*?^```",
+        lambda code: "\n".join(line.partition(" # ")[2] for line in code[0].splitlines()),
+        outside,
+        flags=re.DOTALL | re.MULTILINE,
+    )
+    return MEASURED.findall(re.sub(r"`[^`]*`|\]\([^)]*\)", "", outside, flags=re.DOTALL))
 
 
-@pytest.mark.parametrize("name", ["docs/benchmarks.md", "docs/trade.md"])
+@pytest.mark.parametrize("name", LIMITS)
 def test_no_measured_figure_stands_outside_of_the_blocks(name: str) -> None:
-    assert measured_figures((REPOSITORY / name).read_text(encoding="utf-8")) == []
+    text = (REPOSITORY / name).read_text(encoding="utf-8")
+    assert LIMITS[name] in text
+    assert measured_figures(text.replace(LIMITS[name], "")) == []
 
 
 def test_what_to_expect_of_the_readme_is_a_block() -> None:
@@ -74,9 +93,18 @@ def test_what_to_expect_of_the_readme_is_a_block() -> None:
     assert "<!-- benchmarks: expect -->" in section and measured_figures(section) == []
 
 
+TYPED = """It loses 0.10 dB in 4 kB, 36.2 PSNR and 12 decibels, is 3.5x as fast, and takes 2 hours,
+ten seconds, a quarter of an hour, half a minute or 5 to 12 minutes: two and a half hours in all.
+```bash
+vfr-bake model.pt out/ --minutes 5  # takes 9 minutes
+```
+"""
+
+
 def test_a_figure_that_was_typed_in_is_found() -> None:
-    assert measured_figures("It loses 0.10 dB in `1 MB`.\n<!-- benchmarks: x -->\n3 dB\n<!-- /benchmarks -->")
+    assert len(measured_figures(TYPED)) == 12
     assert not measured_figures("<!-- benchmarks: x -->\n3 dB\n<!-- /benchmarks -->")
+    assert not measured_figures("One file of 800x800 pixels, 8-bit codes, blocks of 8 x 8, in `1 MB`.")
 
 
 def test_a_page_without_results_names_the_commands() -> None:
