@@ -22,11 +22,10 @@ from vfr_bake.data.features import Features, pairs_to_match
 from vfr_bake.data.files import video
 from vfr_bake.data.files.estimate_record import EstimateRecord, read_record, write_record
 from vfr_bake.data.files.listing import find_pictures, other_kinds, passed_over, unread_cameras
-from vfr_bake.data.files.looks import Look, look_at
 from vfr_bake.data.files.masks import check_masks, mask_of, stray_masks
 from vfr_bake.data.files.opening import SUFFIXES
-from vfr_bake.data.files.repeats import repeats
 from vfr_bake.data.kept_matches import KeptMatches, stamp
+from vfr_bake.data.looks import Look, look_at
 from vfr_bake.data.mapping import (
     FIRST_ATTEMPT,
     FURTHER_ATTEMPTS,
@@ -41,6 +40,7 @@ from vfr_bake.data.mapping import (
 )
 from vfr_bake.data.models.folds import agreeing_pairs, is_near, torn_neighbours
 from vfr_bake.data.models.joining import joined
+from vfr_bake.data.quality.repeats import repeats
 from vfr_bake.data.world import find_up, turn_to_z
 
 MODEL_FILES = ("cameras.bin", "images.bin", "points3D.bin")
@@ -143,14 +143,14 @@ def estimate_cameras(
     until the end.
 
     Pictures are turned upright as EXIF says. Those that show what another one shows are left out
-    (`vfr_bake.data.files.repeats`). Pictures of one size, and of one maker, model and focal length where EXIF
-    tells, share one camera (model RADIAL), which begins with EXIF's focal length. In the model the z axis is
-    up (`vfr_bake.data.world`); the unit is arbitrary, because pictures alone do not tell it. A subject that
-    looks the same from two sides is folded if nothing but the subject is matched: the two sides become one,
-    as if the camera had gone half way around. Pictures of one walk, named in its order, are unfolded
-    (`vfr_bake.data.models.folds`). Pictures in no order are not; only their surroundings can prevent the
-    fold. Models that share pictures are joined (`vfr_bake.data.models.joining`); of others the largest is
-    taken.
+    (`vfr_bake.data.quality.repeats`). Pictures of one size, and of one maker, model and focal length where
+    EXIF tells, share one camera (model RADIAL), which begins with EXIF's focal length. In the model the z
+    axis is up (`vfr_bake.data.world`); the unit is arbitrary, because pictures alone do not tell it. A
+    subject that looks the same from two sides is folded if nothing but the subject is matched: the two sides
+    become one, as if the camera had gone half way around. Pictures of one walk, named in its order, are
+    unfolded (`vfr_bake.data.models.folds`). Pictures in no order are not; only their surroundings can prevent
+    the fold. Models that share pictures are joined (`vfr_bake.data.models.joining`); of others the largest
+    is taken.
 
     Raises DataError (no pictures that can be used, with advice on what to photograph differently; a COLMAP
     model as text), FormatError (a damaged `sparse/0`), OutputError (the folder is read-only, or the disk of

@@ -11,7 +11,7 @@ from PIL import Image
 from tests.vfr_bake.data.test_poses import textured
 from vfr_bake.data import mapping
 from vfr_bake.data.features import _n_matches, find_features, match, pairs_to_match
-from vfr_bake.data.files.looks import sensor_of
+from vfr_bake.data.looks import sensor_of
 
 
 def test_features_follow_the_picture_to_its_own_pixels(monkeypatch: pytest.MonkeyPatch):

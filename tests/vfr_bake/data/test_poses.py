@@ -230,7 +230,7 @@ def test_an_interrupted_estimation_goes_on_where_it_was(can, tmp_path: Path, kep
     shutil.copy(sorted(can[0].glob("*.jpg"))[5], photos)
     looked, matched = [], []
     monkeypatch.setattr(
-        "vfr_bake.data.files.looks.find_features", lambda rgba: looked.append(1) or find_features(rgba)
+        "vfr_bake.data.looks.find_features", lambda rgba: looked.append(1) or find_features(rgba)
     )
     monkeypatch.setattr(mapping, "match", lambda a, b: matched.append(1) or match(a, b))
     assert estimate_cameras(photos, quiet).n_registered == 6

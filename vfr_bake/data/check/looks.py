@@ -29,8 +29,8 @@ from vfr_bake.data.files.pictures import (
     sharpness,
     shrunk,
 )
-from vfr_bake.data.files.repeats import repeats
 from vfr_bake.data.kept_matches import SIDE
+from vfr_bake.data.quality.repeats import repeats
 from vfr_bake.data.quality.sharpness import blur
 from vfr_bake.data.threads import n_threads, one_by_one
 
@@ -169,7 +169,7 @@ def look_at(
 
 
 def repeated_ones(looks: Sequence[PictureMeasures | None]) -> set[int]:
-    """Return the numbers of the pictures that show what another one shows (`vfr_bake.data.files.repeats`)."""
+    """Return the numbers of the pictures that repeat another one (`vfr_bake.data.quality.repeats`)."""
     there = [(i, seen) for i, seen in enumerate(looks) if seen is not None]
     if not there:
         return set()

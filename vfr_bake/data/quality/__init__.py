@@ -1,1 +1,1 @@
-"""Measurements of the quality of pictures, made before anything is learned from them."""
+"""Measurements of blur, and the pictures that repeat another one: before anything is learned from them."""

@@ -15,9 +15,9 @@ from player.cameras.transforms import write_cameras
 from player.errors import DataError
 from vfr_bake.data import load_scene
 from vfr_bake.data.demo import demo_views
-from vfr_bake.data.files.looks import sensor_of
 from vfr_bake.data.files.orientation import TAG, as_stored, read_layout, turned_upright
 from vfr_bake.data.files.pictures import decoding_bytes, read_picture
+from vfr_bake.data.looks import sensor_of
 
 pillow_heif.register_heif_opener()
 

@@ -16,10 +16,10 @@ from player.progress import Progress
 from tests.vfr_bake.data.files.test_orientation import save_turned
 from vfr_bake.data import threads
 from vfr_bake.data.features import find_features, match
-from vfr_bake.data.files.looks import look_at
 from vfr_bake.data.files.pictures import decoding_bytes, read_picture
-from vfr_bake.data.files.repeats import repeats
 from vfr_bake.data.kept_matches import KeptMatches
+from vfr_bake.data.looks import look_at
+from vfr_bake.data.quality.repeats import repeats
 
 
 def blots(width: int, height: int, size: int = 8) -> np.ndarray:
@@ -64,7 +64,7 @@ def test_what_is_kept_is_not_looked_at_again(tmp_path: Path, monkeypatch: pytest
     Image.fromarray(blots(160, 120)).save(tmp_path / "a.png")
     progress: Progress = lambda done, of: None  # noqa: E731
     (first,) = look_at([(tmp_path / "a.png", None)], KeptMatches(tmp_path / "kept"), progress)
-    monkeypatch.setattr("vfr_bake.data.files.looks.find_features", None)
+    monkeypatch.setattr("vfr_bake.data.looks.find_features", None)
     (again,) = look_at([(tmp_path / "a.png", None)], KeptMatches(tmp_path / "kept"), progress)
     assert again.sharpness == first.sharpness and np.array_equal(again.features.sift, first.features.sift)
 
