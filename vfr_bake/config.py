@@ -288,13 +288,18 @@ class TrainConfig:
         check(self, "scale", known, "two pictures, and a distance of more than 0")
         check(self, "effort", self.effort in get_args(Effort), f"one of {get_args(Effort)}")
         check(self, "device", self.device in get_args(Device), f"one of {get_args(Device)}")
-        check(self, "minutes", self.minutes is None or self.minutes > 0, "more than 0")
+        fits = self.minutes is None or 0 < self.minutes <= 1e6
+        check(self, "minutes", fits, "more than 0, and at most a million")
         check(self, "step_cells", 0.1 <= self.step_cells <= 16, "0.1 to 16")
         check(self, "occupancy_resolution", 8 <= self.occupancy_resolution <= 512, "8 to 512")
         check(self, "near_gradients", 0 <= self.near_gradients < 1e3, "0 to 1000")
+        check(self, "seed", 0 <= self.seed < 2**63, "at least 0, and less than 2**63")
         check(self, "eval_views", self.eval_views is None or self.eval_views >= 0, "at least 0")
         check(self, "checkpoint_minutes", self.checkpoint_minutes > 0, "more than 0")
-        self.for_device("cpu", False)  # so that values out of range are refused before pictures are read
+        # So that values out of range are refused before pictures are read. The kind of scene, where it is not
+        # given, may turn out to be the one with the finer grid, which allows more.
+        self.for_device("cpu", False)
+        self.field.resolved(self.kind != "object")
 
     def minutes_for(self, device: str, unbounded: bool) -> float:
         """Return the largest number of minutes of training on `device` ("cpu" or "cuda").

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from tests.vfr_bake.training.test_trainer import config, unbounded
 from vfr_bake.config import FieldOptions, TrainConfig
 from vfr_bake.data.demo import demo_scene
 from vfr_bake.data.scene import Scene
+from vfr_bake.evaluation import render_views
 from vfr_bake.field.field import VfrField
 from vfr_bake.field.hash_grid import Backend
 from vfr_bake.field.networks import Pilot
@@ -21,7 +23,6 @@ from vfr_bake.rendering.occupancy import OccupancyGrid
 from vfr_bake.training.checkpoint import load_checkpoint, save_checkpoint
 from vfr_bake.training.model_file import load_model, save_model, trained_model
 from vfr_bake.training.processes import Processes
-from vfr_bake.training.scores.evaluation import render_views
 from vfr_bake.training.trainer import Trainer, choose_device
 
 
@@ -193,6 +194,29 @@ def test_what_is_not_given_follows_from_the_device() -> None:
     assert (best.log2_table_size, best.sh_degree) == (22, 7)
     assert FieldOptions().resolved(True, "cpu", "best") == FieldOptions().resolved(True, "cpu")
     assert FieldOptions().resolved(False, "cuda", "best") == on_gpu
-    for name, value in {"steps": 0, "batch_samples": 3, "network_rate": 1.0, "device": "tpu"}.items():
+
+
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [
+        ("steps", [0]),
+        ("batch_samples", [3]),
+        ("network_rate", [1.0]),
+        ("device", ["tpu"]),
+        ("seed", [-5, 2**63]),
+        ("minutes", [0.0, 1e16, math.inf, math.nan]),
+    ],
+)
+def test_settings_out_of_range_are_refused(name: str, values: list[object]) -> None:
+    for value in values:
         with pytest.raises(ConfigError, match=f"{name}: expected"):
             TrainConfig(**{name: value})  # type: ignore[arg-type]
+
+
+def test_architectures_out_of_range_are_refused_before_the_kind_of_scene_is_known() -> None:
+    with pytest.raises(ConfigError, match="head_width: expected 4 to 1024, got 3"):
+        TrainConfig(field=FieldOptions(head_width=3))
+    finer = FieldOptions(base_resolution=1024)  # fits the finest level of an unbounded scene alone
+    assert TrainConfig(field=finer).field == finer
+    with pytest.raises(ConfigError, match="base_resolution: expected 2 to max_resolution"):
+        TrainConfig(kind="object", field=finer)
