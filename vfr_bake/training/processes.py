@@ -15,6 +15,8 @@ from typing import TypeVar
 import torch
 from torch import Tensor, distributed
 
+from player.errors import ConfigError
+
 T = TypeVar("T")
 
 PATIENCE = timedelta(days=30)
@@ -34,11 +36,18 @@ class Processes:
 
     @classmethod
     def from_environment(cls) -> Processes:
-        """Join the process group that the environment variables RANK and WORLD_SIZE describe."""
-        size = int(os.environ.get("WORLD_SIZE", "1"))
-        if size > 1 and not distributed.is_initialized():
-            distributed.init_process_group("gloo", timeout=PATIENCE)
-        return cls(int(os.environ.get("RANK", "0")) if size > 1 else 0, size)
+        """Join the process group that the environment variables RANK and WORLD_SIZE describe. Raises
+        ConfigError if they, or those with the address of the first process, are missing or no numbers."""
+        try:
+            size = int(os.environ.get("WORLD_SIZE", "1"))
+            if size <= 1:
+                return cls(0, 1)
+            if not distributed.is_initialized():
+                distributed.init_process_group("gloo", timeout=PATIENCE)
+            return cls(int(os.environ.get("RANK", "0")), size)
+        except ValueError as error:
+            message = f"expected those of torchrun, or no WORLD_SIZE: {error}"
+            raise ConfigError(f"environment variables: {message}") from None
 
     @property
     def first(self) -> bool:

@@ -10,8 +10,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from torch import distributed
 
+from player.errors import ConfigError
 from tests.cores import every_core
 from vfr_bake.training.processes import Processes
 
@@ -85,3 +87,29 @@ def test_a_process_waits_as_long_as_the_first_one_needs(monkeypatch: pytest.Monk
     monkeypatch.setenv("RANK", "1")
     assert not Processes.from_environment().first
     assert given["timeout"] > timedelta(days=1)
+
+
+@pytest.mark.parametrize(
+    ("variables", "named"),
+    [
+        ({"WORLD_SIZE": "x"}, "'x'"),
+        ({"WORLD_SIZE": "2"}, "RANK"),
+        ({"WORLD_SIZE": "2", "RANK": "x"}, "'x'"),
+        ({"WORLD_SIZE": "2", "RANK": "0"}, "MASTER_ADDR"),
+    ],
+)
+def test_an_environment_that_torchrun_did_not_make_is_named(
+    variables: dict[str, str], named: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("WORLD_SIZE", "RANK", "MASTER_ADDR", "MASTER_PORT"):
+        monkeypatch.delenv(name, raising=False)
+    for name, value in variables.items():
+        monkeypatch.setenv(name, value)
+    with pytest.raises(ConfigError, match=named):
+        Processes.from_environment()
+
+
+@pytest.mark.parametrize("size", ["0", "-1", "1"])
+def test_one_process_has_all_of_a_batch(size: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("WORLD_SIZE", size)
+    assert Processes.from_environment().share(torch.arange(3)).tolist() == [0, 1, 2]
