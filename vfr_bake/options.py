@@ -64,7 +64,7 @@ class Bake:
     examples:
       vfr-bake model.pt out/                   small and quick to play
       vfr-bake model.pt out/ --preset phone    the fewest bytes, for pages on phones
-      vfr-bake model.pt out/ --max-mb 5        as good as five megabytes allow
+      vfr-bake model.pt out/ --max-mb 5        the preset, with at most five megabytes
       vfr-bake --convert old/ new/             rewrite an asset of an earlier version of the format
     """
 
