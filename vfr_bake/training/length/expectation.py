@@ -83,7 +83,8 @@ def expectation(
     rounded = round(possible, 1 - len(str(possible)) + 1)
     later = grown(max(possible - EXPECTED_AT, 0), unbounded)
     taken = min(minutes, (seconds + later * seconds_a_step) / 60)
+    minutes_said = f"{taken:.2g}" if taken < 10 else f"{taken:,.0f}"
     return (
-        f"{1000 * seconds_a_step:.0f} ms a step: about {rounded:,} steps in {taken:.2g} minutes at most, "
+        f"{1000 * seconds_a_step:.0f} ms a step: about {rounded:,} steps in {minutes_said} minutes at most, "
         f"which give scenes like this {low} to {high} dB"
     )

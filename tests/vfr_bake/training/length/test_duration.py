@@ -129,6 +129,12 @@ def test_what_is_expected_is_what_was_reached(
     assert low - 0.5 <= reached <= high + 0.5, "both are rounded"
 
 
+@pytest.mark.parametrize(("minutes", "said"), [(0.5, "0.5"), (2.25, "2.2"), (120.0, "120"), (1e4, "10,000")])
+def test_minutes_are_said_in_two_digits_or_whole(minutes: float, said: str) -> None:
+    text = expectation(18.0, 10.0, 0.025, 10**9, minutes, False)
+    assert f" steps in {said} minutes at most" in text
+
+
 def test_the_expectation_leaves_out_the_time_that_compiling_took() -> None:
     assert "about 1,000 steps in 2 minutes" in expectation(18.0, 90.0, 0.05, 1_000_000, 2.0, False)
 
