@@ -1,4 +1,5 @@
-"""Which package may import what, checked in the source and in a process in which torch cannot be imported."""
+"""Which package may import what, checked in the source and in a process in which torch cannot be imported.
+The way of a ray in docs/architecture.md is compared with the code."""
 
 from __future__ import annotations
 
@@ -6,12 +7,19 @@ import ast
 import re
 import subprocess
 import sys
+import threading
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from graphlib import TopologicalSorter
 from pathlib import Path
+from types import FrameType
 
 import pytest
 from packaging.requirements import Requirement
+
+from player.asset.asset import Asset
+from player.cameras.views import asset_cameras
+from player.render import Renderer
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 PACKAGES = ("player", "exporters", "vfr_bake")
@@ -270,3 +278,50 @@ def test_one_file_alone_names_instructions_of_one_processor() -> None:
         if re.search(r"llvm\.(x86|aarch64|arm|nvvm)|InlineAsm|inline_asm", path.read_text(encoding="utf-8"))
     ]
     assert named == ["player/head/dense_tiles.py"]
+
+
+BESIDE_THE_WAY = {"player/asset/asset.py", "player/cameras/camera.py"}
+"""Files whose functions the way of a ray asks for numbers alone: those of the asset and of the camera."""
+
+
+def called_files(asset: Asset) -> set[str]:
+    """Return the player's files whose functions run while a picture is rendered by numpy."""
+    called: set[str] = set()
+
+    def note(frame: FrameType, event: str, _: object) -> None:
+        path = Path(frame.f_code.co_filename)
+        if event == "call" and path.is_relative_to(REPOSITORY / "player"):
+            called.add(path.relative_to(REPOSITORY).as_posix())
+
+    before = sys.getprofile()
+    threading.setprofile(note)  # for the renderer's threads, which begin with its first picture
+    try:
+        with Renderer(asset, 1, "numpy") as renderer:
+            camera = asset_cameras(asset)[0].resized(8, 8)
+            assert renderer.render(camera).opacity.max() > 0.5  # and fills the caches
+            called.clear()
+            sys.setprofile(note)
+            renderer.render(camera)
+    finally:
+        sys.setprofile(before)
+        threading.setprofile(before)
+    return called
+
+
+@pytest.mark.parametrize("contracted", [False, True])
+def test_the_way_of_a_ray_takes_ten_files_which_are_those_of_the_manual(
+    contracted: bool, shells_folder: Path
+) -> None:
+    asset = Asset.open(shells_folder)
+    if contracted:
+        space = ((-2.0, -2.0, -2.0), (2.0, 2.0, 2.0))
+        asset = replace(asset, manifest=replace(asset.manifest, contracted=True, aabb=space))
+    text = (REPOSITORY / "docs" / "architecture.md").read_text(encoding="utf-8")
+    way = text.split("## The way of one ray\n")[1].split("\n##")[0]
+    named = re.findall(r"\]\(\.\./(player/[^)]+)\)", way)
+    assert len(named) == len(set(named)), "a file is linked to twice"
+    of_a_box = {"player/march/bounds.py", "player/march/box.py"}
+    of_space = {"player/march/contracted.py", "player/march/contraction.py"}
+    taken = set(named) - (of_a_box if contracted else of_space)
+    assert len(taken) == len(re.findall(r"^\d+\. ", way, re.MULTILINE)) == 10
+    assert called_files(asset) - BESIDE_THE_WAY == taken
