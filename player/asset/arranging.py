@@ -26,6 +26,9 @@ from player.errors import FormatError
 
 SHARES = (0.025, 0.1, 0.25, 0.5, 1.0)
 """The largest share of all bytes that is read up to the end of the first part, of the second, ..."""
+OTHERS = 9
+"""Bytes of the other files for each byte of a mesh that a bake makes: the mesh takes at most a tenth of the
+asset's bytes."""
 THREADS = 2
 """Number of sections that are encoded at a time: each takes memory of its own."""
 
@@ -45,7 +48,7 @@ class WrittenPart(NamedTuple):
 
 
 def write_parts(
-    densities: PyramidValues, features: PyramidValues, manifest: Manifest, n_before: int, n_behind: int
+    densities: PyramidValues, features: PyramidValues, manifest: Manifest, n_before: int, n_behind: int | None
 ) -> list[WrittenPart]:
     """Encode an asset's values as parts.
 
@@ -53,7 +56,8 @@ def write_parts(
         densities, features: the codes to store.
         manifest: has the quantization steps of the levels.
         n_before: bytes of the files that are read before the first part.
-        n_behind: bytes of the files that are read after the last part.
+        n_behind: bytes of the mesh, which is read after the last part; None if it is not made yet, and will
+            take at most a byte for OTHERS bytes of the other files.
 
     Raises FormatError: there are values that the steps of the manifest cannot reach.
     """
@@ -62,6 +66,8 @@ def write_parts(
             *_sections("densities", densities, manifest.density_steps, threads),
             *_sections("features", features, manifest.feature_steps, threads),
         ]
+    if n_behind is None:
+        n_behind = (n_before + sum(len(written.data) for written in sections)) * 0
     return list(_cut(sorted(sections, key=_turn), n_before, n_behind))
 
 

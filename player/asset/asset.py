@@ -291,7 +291,7 @@ def write_asset(
     manifest: Manifest,
     arrays: GridArrays,
     head: bytes,
-    mesh: bytes,
+    mesh: bytes | None,
     cameras: bytes,
     force: bool = False,
     finish: Callable[[Path], dict[str, bytes]] | None = None,
@@ -303,7 +303,8 @@ def write_asset(
         manifest: everything but `parts` and `files`, which are filled in here.
         arrays: checked before anything is written.
         head: bytes of `head.onnx`.
-        mesh: bytes of `mesh.ply`, world frame.
+        mesh: bytes of `mesh.ply`, world frame; None if `finish` returns it. Parts are then cut as if it took
+            the tenth of the asset's bytes that it may take at most.
         cameras: bytes of `cameras.json`, world frame.
         force: replace a folder that exists, if it holds an asset and nothing else.
         finish: called with the temporary folder of the complete asset, which can already be played. It
@@ -317,12 +318,13 @@ def write_asset(
     force = check_asset_target(folder, force)
     arrays.check(manifest)
     n_before = len(head) + len(cameras)
-    parts = write_parts(arrays.densities, arrays.features, manifest, n_before, len(mesh))
+    n_behind = None if mesh is None else len(mesh)
+    parts = write_parts(arrays.densities, arrays.features, manifest, n_before, n_behind)
     manifest = replace(manifest, version=VERSION, parts=tuple(part.part for part in parts), files={})
     with new_folder(folder, force) as new:
         for part in parts:
             (new / part.part.file).write_bytes(part.data)
-        for name, data in (("head.onnx", head), ("mesh.ply", mesh), ("cameras.json", cameras)):
+        for name, data in (("head.onnx", head), ("mesh.ply", mesh or b""), ("cameras.json", cameras)):
             (new / name).write_bytes(data)
         _write_manifest(new, manifest)
         if finish is not None:

@@ -24,6 +24,7 @@ from exporters.formats.ply import small_ply_bytes
 from exporters.head.onnx_head import HeadWeights, Range, head_onnx
 from exporters.shapes.mesh import TriangleMesh
 from exporters.surface.asset_surface import Removed
+from player.asset.arranging import OTHERS
 from player.asset.asset import Asset, GridArrays, write_asset
 from player.asset.manifest import Manifest
 from player.asset.target import check_asset_target
@@ -66,7 +67,7 @@ from vfr_bake.baking.limits import (
     page_memory,
     unwritten_asset,
 )
-from vfr_bake.baking.mesh import OTHERS, bake_mesh, mesh_bytes
+from vfr_bake.baking.mesh import bake_mesh, mesh_bytes
 from vfr_bake.baking.plan import make_plan, photographed, refinement_seconds
 from vfr_bake.baking.qualities import Qualities, compared_views, fitting_qualities
 from vfr_bake.baking.rate.importance import importance
@@ -204,7 +205,7 @@ class _Bake:
         with self._part(LAST_PART):
             manifest = replace(manifest, provenance=manifest.provenance | {"baked": figures})
             cameras = write_cameras(self.model.cameras)
-            write_asset(folder, manifest, arrays, head, b"", cameras, force, finish)
+            write_asset(folder, manifest, arrays, head, None, cameras, force, finish)
         last = self.held_out.stages[-1]
         figures |= {"psnr_to_full_model": last.psnr, "loss_db": last.loss.db, "time": self.seconds}
         figures |= {"loss_db_spread": last.loss.stated}

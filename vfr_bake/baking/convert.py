@@ -81,7 +81,7 @@ def convert(
         baked = bake_mesh(written, RESOLUTION, most, allowed_bytes(max_memory) / 1e9, silent)
         return reports | {"mesh.ply": small_ply_bytes(baked.mesh)}
 
-    write_asset(new, manifest, GridArrays(densities, features), head, b"", cameras, force, finish)
+    write_asset(new, manifest, GridArrays(densities, features), head, None, cameras, force, finish)
     tell(STEPS, STEPS)
     n_bytes = sum(path.stat().st_size for path in new.iterdir())
     return Converted(asset, n_bytes, time.perf_counter() - begin)

@@ -13,14 +13,13 @@ from exporters.surface.asset_surface import AssetSurface, Removed
 from exporters.surface.depth_views import FEW_PIXELS
 from exporters.surface.few_faces import few_faces
 from exporters.surface.inner_region import inner_region
+from player.asset.arranging import OTHERS
 from player.asset.asset import Asset
 from player.errors import ConfigError, DataError
 from player.progress import Report
 
 VIEWS = 50
 """Most views that are rendered for the mesh."""
-OTHERS = 9
-"""Bytes of the other files for each byte of the mesh, which is thus at most a tenth of the asset."""
 
 
 class BakedMesh(NamedTuple):
