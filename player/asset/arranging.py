@@ -67,7 +67,7 @@ def write_parts(
             *_sections("features", features, manifest.feature_steps, threads),
         ]
     if n_behind is None:
-        n_behind = (n_before + sum(len(written.data) for written in sections)) * 0
+        n_behind = (n_before + sum(len(written.data) for written in sections)) // OTHERS
     return list(_cut(sorted(sections, key=_turn), n_before, n_behind))
 
 
