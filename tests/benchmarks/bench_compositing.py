@@ -22,8 +22,8 @@ import numpy as np
 from vfr_bake.config import Compositing, FieldOptions, TrainConfig
 from vfr_bake.data import load_scene
 from vfr_bake.data.scene import Scene, evenly
+from vfr_bake.evaluation import render_views
 from vfr_bake.training.model_file import trained_model
-from vfr_bake.training.scores.evaluation import render_views
 from vfr_bake.training.trainer import Trainer
 
 KINDS: tuple[Compositing, ...] = ("features", "colour")

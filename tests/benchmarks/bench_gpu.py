@@ -23,8 +23,8 @@ from torch.profiler import ProfilerActivity, profile, record_function
 from vfr_bake.config import TrainConfig
 from vfr_bake.data import load_scene
 from vfr_bake.data.scene import evenly
+from vfr_bake.evaluation import render_views
 from vfr_bake.training.model_file import trained_model
-from vfr_bake.training.scores.evaluation import render_views
 from vfr_bake.training.trainer import StepReport, Trainer
 
 PARTS = {

@@ -27,10 +27,10 @@ from vfr_bake.config import EFFORT_MINUTES, TrainConfig
 from vfr_bake.data import load_scene
 from vfr_bake.data.poses import PoseReport
 from vfr_bake.data.scene import PosedImages
+from vfr_bake.evaluation import RenderedView
 from vfr_bake.rendering.render import render_image
 from vfr_bake.training.checkpoint import checkpoint_path, save_checkpoint
 from vfr_bake.training.model_file import Model, load_model, save_model
-from vfr_bake.training.scores.evaluation import RenderedView
 from vfr_bake.training.scores.metrics import over_background, psnr, to_8_bit
 from vfr_bake.training.trainer import Trainer
 
@@ -202,7 +202,7 @@ def test_a_view_without_error_is_null_in_json(
             rgb = over_background(image, model.background)
             yield RenderedView(camera.name, rgb, rgb)
 
-    monkeypatch.setattr("vfr_bake.training.scores.evaluation.render_views", perfect)
+    monkeypatch.setattr("vfr_bake.evaluation.render_views", perfect)
     target = tmp_path / "eval.json"
     assert eval_main([str(model), str(small_data), "--json", str(target)]) == 0
     figures = json.loads(target.read_text(), parse_constant=pytest.fail)
@@ -393,7 +393,7 @@ def test_a_training_that_was_complete_already_gives_a_model_that_bakes(
 
 
 def test_test_views_without_error_are_null_in_json(model: Path, small_data: Path, monkeypatch) -> None:
-    monkeypatch.setattr("vfr_bake.training.scores.evaluation.quick_psnr", lambda *_: ([np.inf], []))
+    monkeypatch.setattr("vfr_bake.evaluation.quick_psnr", lambda *_: ([np.inf], []))
     figures = _test_figures(load_model(model), load_scene(small_data), 1, np.inf)
     assert figures["test_psnr"] is None and figures["test_views"] == 1
 

@@ -37,8 +37,8 @@ from vfr_bake.bench.worst import WorstPixel, worst_pixels
 from vfr_bake.config import BenchConfig
 from vfr_bake.data import check_settings, load_scene_as
 from vfr_bake.data.scene import evenly
+from vfr_bake.evaluation import RenderedView, beside_photograph
 from vfr_bake.training.model_file import load_model
-from vfr_bake.training.scores.evaluation import RenderedView, beside_photograph
 from vfr_bake.training.scores.metrics import Distance, mean, mean_scores, psnr, ssim
 from vfr_bake.training.scores.views import Learned, scored_views, spread_order
 

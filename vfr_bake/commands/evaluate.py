@@ -20,8 +20,8 @@ def eval_command(options: Any) -> int:
     from player.cameras.transforms import frame_names
     from player.files.images import write_png
     from vfr_bake.data import load_scene_as
+    from vfr_bake.evaluation import render_views
     from vfr_bake.training.model_file import load_model
-    from vfr_bake.training.scores.evaluation import render_views
     from vfr_bake.training.scores.lpips import Lpips
     from vfr_bake.training.scores.metrics import comparison, mean_scores
     from vfr_bake.training.scores.views import Learned, scored_views

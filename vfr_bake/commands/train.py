@@ -137,9 +137,9 @@ def _finish(
     it ends them. The model is complete, and is reported without them. An `interrupted` training is measured
     only on what it has learned from, and leaves a checkpoint.
     """
+    from vfr_bake.evaluation import training_psnr
     from vfr_bake.training.checkpoint import checkpoint_path
     from vfr_bake.training.model_file import save_model, trained_model
-    from vfr_bake.training.scores.evaluation import training_psnr
 
     checkpoint, config = checkpoint_path(options.model), trainer.config
     stopped, witnesses = interrupted, None
@@ -415,7 +415,7 @@ def _report_training(options: Any, figures: dict[str, Any], interrupted: bool) -
 
 
 def _test_figures(model: Model, scene: Scene, n_views: int, most_seconds: float) -> dict[str, Any]:
-    from vfr_bake.training.scores.evaluation import quick_psnr
+    from vfr_bake.evaluation import quick_psnr
 
     with Bar("test views") as bar:
         scores, lines = quick_psnr(model, scene, n_views, most_seconds, bar.count)

@@ -20,8 +20,8 @@ from vfr_bake.config import FieldOptions, TrainConfig
 from vfr_bake.data.demo import demo_scene
 from vfr_bake.data.scene import Scene
 from vfr_bake.data.store.capture import PosedImages
+from vfr_bake.evaluation import render_views
 from vfr_bake.training.model_file import trained_model
-from vfr_bake.training.scores.evaluation import render_views
 from vfr_bake.training.trainer import Trainer
 
 SMALL_GRID = {"n_levels": 8, "max_resolution": 64, "log2_table_size": 14, "density_width": 16}

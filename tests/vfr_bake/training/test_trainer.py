@@ -24,6 +24,7 @@ from vfr_bake.data.store import stored
 from vfr_bake.data.store.capture import PosedImages
 from vfr_bake.data.store.stored import StoreLayout, in_order, map_pictures, write_picture
 from vfr_bake.data.store.working import WorkingSize
+from vfr_bake.evaluation import render_views, training_psnr
 from vfr_bake.field.hash_grid import Backend
 from vfr_bake.training.checkpoint import load_checkpoint, save_checkpoint
 from vfr_bake.training.gradients import CERTAIN, chosen_rays, scale_near_gradients
@@ -31,7 +32,6 @@ from vfr_bake.training.model_file import trained_model
 from vfr_bake.training.optimiser import DENSITY_DECAY
 from vfr_bake.training.processes import Processes
 from vfr_bake.training.rays import Batch, PixelSampler, RayBatch
-from vfr_bake.training.scores.evaluation import render_views, training_psnr
 from vfr_bake.training.scores.metrics import decibels
 from vfr_bake.training.trainer import Trainer
 

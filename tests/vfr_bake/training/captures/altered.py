@@ -11,8 +11,8 @@ from vfr_bake.data.demo import demo_capture
 from vfr_bake.data.demo_solids import CENTRE, SCALE
 from vfr_bake.data.scene import Scene, build_scene
 from vfr_bake.data.store.capture import PosedImages
+from vfr_bake.evaluation import render_views
 from vfr_bake.training.model_file import trained_model
-from vfr_bake.training.scores.evaluation import render_views
 from vfr_bake.training.trainer import Trainer
 
 

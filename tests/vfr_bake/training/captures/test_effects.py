@@ -10,11 +10,11 @@ import torch
 
 from tests.vfr_bake.training.captures.altered import changed_exposure, scene_of, settings, trained
 from vfr_bake.data.demo import demo_views
+from vfr_bake.evaluation import render_views
 from vfr_bake.training.captures import effects, exposure
 from vfr_bake.training.checkpoint import load_checkpoint, save_checkpoint
 from vfr_bake.training.model_file import load_model, save_model, trained_model
 from vfr_bake.training.processes import Processes
-from vfr_bake.training.scores.evaluation import render_views
 from vfr_bake.training.trainer import Trainer
 
 

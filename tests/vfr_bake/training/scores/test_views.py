@@ -13,8 +13,8 @@ from tests.vfr_bake.training.captures.altered import settings
 from vfr_bake.data.demo import demo_scene
 from vfr_bake.data.scene import Scene
 from vfr_bake.data.store.capture import PosedImages
+from vfr_bake.evaluation import quick_psnr, render_views
 from vfr_bake.training.model_file import Model, trained_model
-from vfr_bake.training.scores.evaluation import quick_psnr, render_views
 from vfr_bake.training.scores.views import Learned, check_cameras, scored_views, seen_views
 from vfr_bake.training.trainer import Trainer
 
