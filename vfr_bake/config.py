@@ -12,7 +12,7 @@ from typing import Any, Literal, get_args
 from player.app.option_types import size
 from player.errors import ConfigError
 from player.files.json_files import brief
-from player.files.memory import allowed_bytes
+from player.files.memory import SHARE, allowed_bytes
 from vfr_bake.presets import PRESETS, UNBOUNDED, BakeChoice, Preset
 
 SceneKind = Literal["auto", "object", "unbounded"]
@@ -328,8 +328,8 @@ class TrainConfig:
         )
 
 
-USUAL_MEMORY = 4.0
-"""Gigabytes of memory that a bake takes at most if no number is given."""
+USUAL_MEMORY, LEAST_MEMORY = 4.0, 0.85
+"""Gigabytes of memory that a bake takes at most if no number is given, and that the smallest bake needs."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -384,7 +384,7 @@ class BakeConfig:
     all the same."""
     max_memory: float | None = None
     """Gigabytes of memory that the bake may take: with less, the bake learns from fewer rays and its grids
-    are coarser. Not given: 4, or half of the machine's memory if that is less."""
+    are coarser. Not given: half of the machine's memory, at most 4, and at least 0.85, which any bake needs."""
     check_views: int = 4
     """Views between the training cameras on which each step of the bake is compared with the model's own
     pictures; 1 to 1,000; the more views, the fewer pixels of each are compared."""
@@ -418,7 +418,9 @@ class BakeConfig:
     @property
     def memory(self) -> float:
         """Gigabytes of memory that the bake may take on this machine."""
-        return min(USUAL_MEMORY, allowed_bytes() / 1e9) if self.max_memory is None else self.max_memory
+        half = allowed_bytes() / 1e9
+        usual = min(USUAL_MEMORY, max(half, min(LEAST_MEMORY, half / SHARE)))  # no more than there is
+        return usual if self.max_memory is None else self.max_memory
 
     def choice(self, unbounded: bool = False) -> BakeChoice:
         """Return the preset's choice for an object or an unbounded scene; settings that are given replace it.

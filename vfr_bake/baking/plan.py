@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from exporters.head.onnx_head import head_onnx
 from player.cameras.transforms import write_cameras
 from player.errors import ConfigError, TrainingError
 from player.kept_code import is_kept
@@ -25,6 +26,7 @@ from vfr_bake.baking.cells import (
     rays_of_views,
 )
 from vfr_bake.baking.distillation import render_teacher
+from vfr_bake.baking.head import fold_head, small_head
 from vfr_bake.baking.held_out import BETWEEN
 from vfr_bake.baking.limits import WIDTHS, cells_of_page
 from vfr_bake.baking.refinement import BATCH, HEAD_BATCH, head_steps, refined_steps, steps_at_k
@@ -99,6 +101,8 @@ COMPILE_SECONDS = 45.0
 """Seconds that the first bake after an installation spends on compiling its code: about half a minute of the
 bake of `make demo` with AVX-512, and a minute without."""
 
+FEWEST_MANIFEST_BYTES = 5000
+"""Bytes that the manifest of a bake takes at least, even with the coarsest grids."""
 CULLING_BYTES = 8
 """Bytes that each cell of a box takes while it is decided which cells are left out: marks of the cells that
 may hold matter, of those that weigh enough and of their neighbours, and distances to them. A byte for each
@@ -164,13 +168,13 @@ def make_plan(model: Model, config: BakeConfig) -> Plan:
     """Plan a bake that takes at most `config.memory` gigabytes.
 
     Raises ConfigError if even the fewest rays, or the marks of the cells, do not fit; TrainingError if the
-    cameras and the head alone take more than `config.max_mb`.
+    cameras, the head and the manifest alone take more than `config.max_mb`.
     """
     choice, field = config.choice(model.field.config.unbounded), model.field.config
     if config.max_mb is not None and (least := _fixed_bytes(model, config) / 1e6) >= config.max_mb:
         raise TrainingError(
             f"bake: size: expected at most {config.max_mb:g} MB, got {np.ceil(100 * least) / 100:.2f} MB for "
-            f"{len(model.cameras)} cameras and the head alone: nothing was written: allow more"
+            f"{len(model.cameras)} cameras, the head and the manifest alone: nothing was written: allow more"
         )
     room = config.memory * 1e9 - PROGRAM_BYTES
     mark_bytes = _marks_bytes(model, config)
@@ -199,14 +203,17 @@ def make_plan(model: Model, config: BakeConfig) -> Plan:
 
 
 def _fixed_bytes(model: Model, config: BakeConfig) -> int:
-    """Return the least bytes that the cameras and the head take, however coarse the grids are."""
-    choice, field = config.choice(model.field.config.unbounded), model.field.config
-    width, n_layers = choice.head_width, choice.head_layers + 1
+    """Return the least bytes that the cameras, the head and the manifest take, however coarse the grids are
+    and however few channels they have. A small head takes the least if it does without directions."""
+    choice = config.choice(model.field.config.unbounded)
+    width, n_channels = choice.head_width, config.n_channels or 1
     if config.target_ms is not None:
-        width = min(WIDTHS)  # the head may become so narrow
-    elif not width:
-        width, n_layers = field.head_width, field.n_directional_layers
-    return len(write_cameras(model.cameras)) + n_layers * width**2 * choice.head_bits // 8
+        width = min(width or WIDTHS[0], *WIDTHS)  # the head may become so narrow
+    head = fold_head(model.field.head, np.zeros((model.field.head.width, n_channels)))
+    if width:
+        head = small_head(head, width, choice.head_layers, 1, np.ones(n_channels))
+    any_ranges = [(0.0, 1.0)] * (2 + len(head.directional)) if choice.head_bits == 8 else None
+    return len(write_cameras(model.cameras)) + len(head_onnx(head, any_ranges)) + FEWEST_MANIFEST_BYTES
 
 
 def _resolutions(model: Model, config: BakeConfig, most: float) -> Resolutions:

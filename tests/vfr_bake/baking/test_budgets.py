@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from exporters.head.onnx_head import head_onnx
 from player.asset.asset import Asset
 from player.cameras.camera import Camera
 from player.cameras.transforms import write_cameras
@@ -22,6 +23,7 @@ from tests.exporters.meshes import read_ply
 from vfr_bake.baking.bake import _Bake, bake
 from vfr_bake.baking.cells import FLOORS, Resolutions
 from vfr_bake.baking.grids import Layout
+from vfr_bake.baking.head import fold_head, small_head
 from vfr_bake.baking.limits import RESERVE, file_sizes, keep_to_time
 from vfr_bake.baking.mesh import bake_mesh
 from vfr_bake.baking.plan import (
@@ -31,6 +33,7 @@ from vfr_bake.baking.plan import (
     CULLING_BYTES,
     FASTER,
     FEW_DRAWN,
+    FEWEST_MANIFEST_BYTES,
     FEWEST_RAYS,
     HEAD_COST,
     MOST_TIMED,
@@ -50,7 +53,7 @@ from vfr_bake.baking.plan import (
     make_plan,
 )
 from vfr_bake.baking.refinement import BATCH, HEAD_BATCH, HEAD_SHARE, Stored, Tuning
-from vfr_bake.config import BakeConfig
+from vfr_bake.config import LEAST_MEMORY, BakeConfig
 from vfr_bake.kernels import SOURCES
 from vfr_bake.presets import PRESETS, Preset
 from vfr_bake.training.length.witness_loss import Loss
@@ -199,32 +202,46 @@ def test_detail_takes_no_more_than_half_of_the_loss_that_is_left(
 def test_a_size_that_cannot_be_met_is_refused_when_the_bake_is_planned(
     model: Model, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The cameras of the pictures, and the head, take bytes that no choice of grids saves."""
+    """The cameras of the pictures, the head and the manifest take bytes that no choice of grids saves."""
     cameras = len(write_cameras(model.cameras))
-    head = model.field.config.n_directional_layers * model.field.config.head_width**2
-    for config, least in (
-        (BakeConfig(resolution=48, refine_steps=0), cameras + head),
-        (BakeConfig(resolution=48), cameras + (PRESETS["balanced"].head_layers + 1) * 64**2),
-        (BakeConfig(resolution=48, target_ms=50), cameras),
+    own = fold_head(model.field.head, np.zeros((model.field.head.width, 1)))
+    eight_bits = [(0.0, 1.0)] * 5
+    for config, head in (
+        (BakeConfig(resolution=48, refine_steps=0), head_onnx(own, eight_bits)),
+        (BakeConfig(resolution=48, refine_steps=0, head_bits=32), head_onnx(own)),
+        (BakeConfig(resolution=48), head_onnx(small_head(own, 64, 3, 1, np.ones(1)), eight_bits)),
+        (
+            BakeConfig(resolution=48, target_ms=50),
+            head_onnx(small_head(own, 16, 3, 1, np.ones(1)), eight_bits),
+        ),
     ):
-        with pytest.raises(TrainingError, match=r"bake: size: expected at most .* and the head alone"):
+        least = cameras + len(head) + FEWEST_MANIFEST_BYTES
+        with pytest.raises(TrainingError, match=r"bake: size: expected at most .* the head and the manifest"):
             make_plan(model, replace(config, max_mb=0.99 * least / 1e6))
-    make_plan(model, BakeConfig(resolution=48, refine_steps=0, max_mb=1.01 * (cameras + head) / 1e6))
+        make_plan(model, replace(config, max_mb=1.01 * least / 1e6))
     many = replace(model, cameras=model.cameras * 200)
-    with pytest.raises(TrainingError, match=r"expected at most 1 MB, got .* MB for \d+ cameras and the head"):
+    with pytest.raises(TrainingError, match=r"expected at most 1 MB, got .* MB for \d+ cameras, the head"):
         make_plan(many, BakeConfig(max_mb=1))
     monkeypatch.setattr("vfr_bake.baking.plan._fixed_bytes", lambda model, config: 1_024_000)
     with pytest.raises(TrainingError, match=r"expected at most 1\.02 MB, got 1\.03 MB for"):
         make_plan(model, BakeConfig(max_mb=1.02))
 
 
-@pytest.mark.parametrize(("machine", "memory"), [(2 << 30, 1.07), (4 << 30, 2.15), (64 << 30, 4.0)])
-def test_a_bake_takes_no_more_than_half_of_a_small_machine(
+@pytest.mark.parametrize(
+    ("machine", "memory"),
+    [(1 << 29, 0.54), (3 << 29, 0.85), (2 << 30, 1.07), (4 << 30, 2.15), (64 << 30, 4.0)],
+)
+def test_a_bake_takes_half_of_a_small_machine_or_what_it_needs(
     machine: int, memory: float, model: Model, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("player.files.memory.available_bytes", lambda: machine)
     assert BakeConfig().memory == pytest.approx(memory, rel=0.01)
-    assert make_plan(model, BakeConfig(resolution=48)).n_bytes <= 1e9 * BakeConfig().memory
+    if memory < LEAST_MEMORY:
+        with pytest.raises(ConfigError, match=r"expected at least 0\.82 GB .* got 0\.537 GB"):
+            make_plan(model, BakeConfig())
+    else:
+        for config in (BakeConfig(), BakeConfig(resolution=48)):
+            assert make_plan(model, config).n_bytes <= 1e9 * config.memory
     assert BakeConfig(max_memory=8).memory == 8
 
 
