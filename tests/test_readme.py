@@ -1,16 +1,22 @@
-"""The commands in the README work, in their order; its picture is there, and its figures are filled in."""
+"""The commands in the README work, in their order, and print what it says; its picture is there."""
 
 from __future__ import annotations
 
 import re
 import shlex
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
 from exporters.cli import main as export
+from player.app import cli
 from player.app.cli import main as play
+from player.app.option_types import DEMO
+from player.viewer import server
 from vfr_bake.cli import bake_main, bench_main, eval_main, train_main
 
 REPOSITORY = Path(__file__).resolve().parent.parent
@@ -59,6 +65,34 @@ def test_the_commands_and_the_python_run(
     assert len(list(Path("frames").glob("*.png"))) == 60
     for code in blocks("python"):
         exec(compile(code, "README.md", "exec"), {})
+
+
+def test_the_first_command_prints_what_the_readme_shows(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The viewer is replaced by one that is ready at once and is interrupted."""
+
+    @contextmanager
+    def serve(*_: Any) -> Iterator[str]:
+        yield "http://127.0.0.1:8080"
+
+    def interrupted(seconds: float) -> bool:
+        raise KeyboardInterrupt
+
+    monkeypatch.setenv("DISPLAY", ":0")
+    monkeypatch.setattr(server, "serve", serve)
+    monkeypatch.setattr(cli, "find_spec", lambda name: True)  # whether viser is installed or not
+    monkeypatch.setattr(cli, "threading", SimpleNamespace(Event=lambda: SimpleNamespace(wait=interrupted)))
+    assert play(["demo"]) == 130
+    said = capsys.readouterr()
+    text = README.split("## Try it")[1].split("![")[0]
+    shown = re.findall(r"^    (?!make |python3 |pip |vfr-play demo)(.*)$", text, re.MULTILINE)
+    folder = str(DEMO.parents[2])
+    printed = [*said.out.splitlines(), *said.err.splitlines()]
+    assert [line.replace(folder, "...").replace("\\", "/") for line in printed] == [
+        *shown,
+        "vfr-play: interrupted",
+    ]
 
 
 def test_make_targets_of_the_readme_exist() -> None:
