@@ -1,8 +1,8 @@
 """Rows of docs/numerics.md, each declared beside the test that checks it, and the worst errors that tests
 have met.
 
-`pytest --numerics FILE` writes what the tests of a run have met, and `python -m tests.numerics.document`
-makes the tables of the page.
+`pytest --numerics FILE` writes what the tests of a run have met, and `python -m tests.numerics.document` adds
+the commit and the processor, and makes the tables of the page.
 """
 
 from __future__ import annotations
@@ -17,7 +17,8 @@ import numpy as np
 
 Met = dict[str, dict[str, dict[str, dict[str, Any]]]]
 """Errors by section, quantity and test (such as `tests/numerics/test_rays.py::test_name`): the worst one in
-the unit of the bound, None if the promise is not about a number, and its case: the test's parameters."""
+the unit of the bound, None if the promise is not about a number, and its case: the test's parameters. In the
+file, each also has the commit and the processor."""
 MET: Met = {}
 """Errors that the tests of this process have met."""
 

@@ -1,4 +1,5 @@
-"""Writes docs/numerics.md from the rows that tests declare and the worst errors that they have met.
+"""Writes docs/numerics.md from the rows that tests declare and the worst errors that they have met, and notes
+beside new errors in docs/numerics.json at which commit and on which processor they were met.
 
 <!-- numerics: SECTION -->
 the table of the rows of this section
@@ -10,9 +11,13 @@ from __future__ import annotations
 import importlib
 import json
 import re
+from collections import Counter
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
-from tests.numerics.bounds import Met, Row
+from tests.benchmarks.suite import conditions
+from tests.numerics.bounds import Met, Row, write
 
 REPOSITORY = Path(__file__).resolve().parent.parent.parent
 PAGE = REPOSITORY / "docs" / "numerics.md"
@@ -23,6 +28,8 @@ HEADER = (
     "| quantity | range | bound | worst met | at its ends | test |",
     "|---|---|---|---|---|---|",
 )
+RUNS = "where the errors were met"
+"""Name of the block that is no section: the commits and processors of the errors."""
 
 
 def modules() -> list[str]:
@@ -63,10 +70,38 @@ def line(row: Row, tests: dict[str, dict]) -> str:
     return f"| {row.quantity} | {row.range} | {bound} | {met} | {row.at_ends} | {where} |"
 
 
+def entries(met: Met) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Yield each test's name and the error that it has met, once for each quantity."""
+    for rows in met.values():
+        for tests in rows.values():
+            yield from tests.items()
+
+
+def stamp(met: Met, commit: str, processor: str) -> None:
+    """Note commit and processor in each entry that has none."""
+    for _, entry in entries(met):
+        if "commit" not in entry:
+            entry.update(commit=commit, processor=processor)
+
+
+def runs(met: Met) -> list[str]:
+    """Return the lines of the table of commits and processors.
+
+    >>> entry = {"worst": 0.0, "case": "", "commit": "0a1b2c3", "processor": "AMD EPYC"}
+    >>> runs({"Rays": {"entry": {"a": entry, "b": entry}}})[2:]
+    ['| AMD EPYC | 0a1b2c3 | 2 |']
+    """
+    counts = Counter((entry["processor"], entry["commit"]) for _, entry in entries(met))
+    lines = [f"| {processor} | {commit} | {n} |" for (processor, commit), n in sorted(counts.items())]
+    return ["| processor | commit | errors |", "|---|---|---|", *lines]
+
+
 def rendered(text: str, rows: list[Row], met: Met) -> str:
     """Return the page with its tables made anew."""
 
     def block(found: re.Match[str]) -> str:
+        if found[2] == RUNS:
+            return "\n".join([found[1], *runs(met), "", found[3]])
         lines = [
             line(row, met.get(row.section, {}).get(row.quantity, {}))
             for row in rows
@@ -82,8 +117,11 @@ def read_worst() -> Met:
 
 
 def main() -> None:
-    rows = [row for found in declared().values() for _, row in found]
-    PAGE.write_text(rendered(PAGE.read_text(encoding="utf-8"), rows, read_worst()), encoding="utf-8")
+    rows, met = [row for found in declared().values() for _, row in found], read_worst()
+    changed = " and changes" if conditions.changed_files() else ""
+    stamp(met, conditions.commit() + changed, conditions.machine()["processor"])
+    write(WORST, met)
+    PAGE.write_text(rendered(PAGE.read_text(encoding="utf-8"), rows, met), encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -17,7 +17,17 @@ import pytest
 from tests import conftest
 from tests.numerics import bounds
 from tests.numerics.bounds import Row
-from tests.numerics.document import BLOCK, PAGE, REPOSITORY, declared, read_worst, rendered
+from tests.numerics.document import (
+    BLOCK,
+    PAGE,
+    REPOSITORY,
+    RUNS,
+    declared,
+    entries,
+    read_worst,
+    rendered,
+    stamp,
+)
 
 ROWS = [row for found in declared().values() for _, row in found]
 
@@ -25,8 +35,10 @@ ROWS = [row for found in declared().values() for _, row in found]
 def test_the_page_is_what_rows_and_worst_cases_give() -> None:
     text = PAGE.read_text(encoding="utf-8")
     assert rendered(text, ROWS, read_worst()) == text, "run: make numerics"
-    assert sorted({row.section for row in ROWS}) == sorted(found[2] for found in BLOCK.finditer(text))
-    lines = [line for found in BLOCK.finditer(text) for line in found[0].splitlines() if line.startswith("|")]
+    tables = {found[2]: found[0] for found in BLOCK.finditer(text)}
+    assert sorted([RUNS, *{row.section for row in ROWS}]) == sorted(tables)
+    del tables[RUNS]
+    lines = [line for table in tables.values() for line in table.splitlines() if line.startswith("|")]
     assert {line.count("|") for line in lines} == {7}
 
 
@@ -51,6 +63,26 @@ def test_every_row_is_checked_where_it_is_declared_by_tests_that_exist() -> None
             for test in met[row.section][row.quantity]:
                 file, _, function = test.partition("::")
                 assert file == path and callable(getattr(module, function)), test
+
+
+def test_every_case_is_one_that_its_test_still_has() -> None:
+    """A test whose parameters changed would otherwise stand on the page with an error of before."""
+    met = [test + (f"[{entry['case']}]" if entry["case"] else "") for test, entry in entries(read_worst())]
+    files = sorted({test.partition("::")[0] for test in met})
+    command = [sys.executable, "-m", "pytest", "-q", "--collect-only", *files]
+    done = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert sorted(set(met) - set(done.stdout.splitlines())) == [], "run: make numerics"
+
+
+def test_a_new_error_is_noted_with_its_commit_and_processor() -> None:
+    old = {"worst": 1.0, "case": "", "commit": "0a", "processor": "one"}
+    met = bounds.merged({"A": {"a": {"x": old, "y": old}}}, {"A": {"a": {"y": {"worst": 2.0, "case": ""}}}})
+    stamp(met, "0b", "another")
+    assert met["A"]["a"] == {
+        "x": old,
+        "y": {"worst": 2.0, "case": "", "commit": "0b", "processor": "another"},
+    }
 
 
 # What a row does ----------------------------------------------------------------------------------
