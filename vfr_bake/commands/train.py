@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import sys
 import time
+from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import fields, is_dataclass, replace
 from functools import cache, partial
@@ -319,11 +320,11 @@ def _train_steps(
 ) -> dict[str, Any]:
     """Train to the end, or to the end of the step in which Ctrl-C is pressed, with a checkpoint now and then;
     return the figures to report. In the first step, and pressed twice, it raises KeyboardInterrupt."""
-    from vfr_bake.training.length.expectation import EXPECTED_AT, TIMED_FROM, typical_step
+    from vfr_bake.training.length.expectation import EXPECTED_AT, SAID_AT, TIMED, typical_step
     from vfr_bake.training.scores.metrics import decibels
 
     interrupted = told = False
-    ends: list[float] = []
+    ends: deque[float] = deque(maxlen=TIMED)
     saved = time.monotonic()
     with Bar("training", trainer.processes.first) as bar:
         error, n_steps, rays = 0.0, 0, 0.0
@@ -343,10 +344,9 @@ def _train_steps(
             if trainer.processes.total(float(ctrl_c.pressed))[0]:  # all processes end after the same step
                 interrupted = True
                 break
-            if TIMED_FROM <= trainer.next_step <= EXPECTED_AT:
-                ends.append(last.seconds)
-            if trainer.next_step == EXPECTED_AT and len(ends) > 1:
-                _expect(trainer, typical_step(ends), bar)
+            ends.append(last.seconds)
+            if (n_steps == SAID_AT or trainer.next_step == EXPECTED_AT) and len(ends) > 1:
+                _expect(trainer, typical_step(list(ends)), bar, n_steps == SAID_AT)
             if preview is not None:
                 preview.update(trainer)
             due = time.monotonic() - saved > 60 * trainer.config.checkpoint_minutes
@@ -387,17 +387,22 @@ def _unsaved(checkpoint: Path, trainer: Trainer) -> str:
     return ""
 
 
-def _expect(trainer: Trainer, seconds_a_step: float, bar: Bar) -> None:
-    """Print, on a line of its own, what the training is likely to reach."""
-    from vfr_bake.training.length.expectation import expectation
+def _expect(trainer: Trainer, seconds_a_step: float, bar: Bar, always: bool) -> None:
+    """Print, on a line of its own, how many steps the training will take, and what it is likely to reach if
+    that is known now. If it is not, print the line only if `always`."""
+    from vfr_bake.training.length.expectation import EXPECTED_AT, expectation
 
-    psnr = trainer.witness_psnr() if trainer.processes.first and trainer.device.type == "cpu" else None
-    if psnr is not None:
-        bar.close()
-        unbounded = trainer.field.config.unbounded
-        length = trainer.pace.steps, trainer.minutes
-        text = expectation(psnr.every, trainer.seconds, seconds_a_step, *length, unbounded)
-        _say(text)
+    if not trainer.processes.first:
+        return
+    step, on_cpu = trainer.next_step, trainer.device.type == "cpu"
+    known = on_cpu and step == EXPECTED_AT and trainer.head_learns
+    witnesses = trainer.witness_psnr() if known else None
+    if witnesses is None and not always:
+        return
+    psnr = None if witnesses is None else witnesses.every
+    length = trainer.pace.steps, trainer.minutes, trainer.field.config.unbounded
+    bar.close()
+    _say(expectation(psnr, step, trainer.seconds, seconds_a_step, *length, on_cpu))
 
 
 def _report_training(options: Any, figures: dict[str, Any], interrupted: bool) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import pkgutil
+import re
 import shutil
 import signal
 from pathlib import Path
@@ -175,6 +176,45 @@ def test_an_interrupted_training_goes_on(
     assert not checkpoint_path(model).exists()
     fields = [load_model(path).field.state_dict() for path in (alone, model)]
     assert all(torch.equal(tensor, fields[1][name]) for name, tensor in fields[0].items())
+
+
+@pytest.fixture
+def told_soon(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let a training say what to expect after 4 steps, and what it is likely to reach after 8."""
+    monkeypatch.setattr("vfr_bake.training.length.expectation.SAID_AT", 4)
+    monkeypatch.setattr("vfr_bake.training.length.expectation.EXPECTED_AT", 8)
+
+
+def expected(capsys: pytest.CaptureFixture[str]) -> list[str]:
+    """Return what has been said of the length, without the speed."""
+    return re.findall(r"ms a step: (about .*)", capsys.readouterr().err)
+
+
+@pytest.mark.usefixtures("told_soon")
+def test_a_training_says_what_to_expect_at_its_start_and_when_it_goes_on(
+    small_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = [str(small_data), str(tmp_path / "model.pt"), *SMALL]
+    press_in_step(8, 1, monkeypatch)
+    assert train_main(words) == 130
+    length, result = expected(capsys)
+    assert re.fullmatch(r"about 12 steps in \S+ minutes at most", length)
+    assert re.fullmatch(r"about 12 steps in \S+ minutes at most, which give .* to \d+ dB", result)
+    monkeypatch.setattr("vfr_bake.training.length.expectation.SAID_AT", 2)
+    assert train_main([*words, "--resume"]) == 0
+    (length,) = expected(capsys)
+    assert re.fullmatch(r"about 12 steps in \S+ minutes at most", length)
+
+
+@pytest.mark.usefixtures("told_soon")
+def test_a_training_whose_error_is_not_known_says_how_long_it_takes(
+    small_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As while exposure or moving things are corrected."""
+    monkeypatch.setattr(Trainer, "witness_psnr", lambda trainer: None)
+    assert train_main([str(small_data), str(tmp_path / "model.pt"), *SMALL]) == 0
+    (length,) = expected(capsys)
+    assert re.fullmatch(r"about 12 steps in \S+ minutes at most", length)
 
 
 @pytest.mark.parametrize(("step", "says"), [(2, True), (6, False)])

@@ -1,4 +1,5 @@
-"""Prediction of the PSNR that a training is likely to reach, from its first steps.
+"""Prediction of the steps that a training will take, and of the PSNR that it is likely to reach, from its
+first steps.
 
 Each doubling of the number of steps gains less than the one before: the total gain grows with the square root
 of the number of doublings. The PSNR after EXPECTED_AT steps is extrapolated by this rule. The factor of the
@@ -12,18 +13,25 @@ import statistics
 from bisect import bisect_left
 from itertools import pairwise
 
-from vfr_bake.training.guides import GROWTH
+from vfr_bake.training.guides import FOG_STEPS, GROWTH
 
-TIMED_FROM, EXPECTED_AT = 300, 400
-"""Steps between which the speed is measured, and at the end of which the result is predicted. Steps before
-the first of them are of the pilot network."""
+TIMED = 100
+"""Number of last steps from which the speed is measured. A step of the pilot network takes about as long as
+one of the head."""
+SAID_AT = 200
+"""Number of steps of a run after which the length of the training is predicted. A training that is resumed is
+a new run, maybe on another machine."""
+EXPECTED_AT = 400
+"""Step after which the result is predicted, too; not earlier, because the first 300 steps teach the pilot
+network, and not the head."""
 DB_OF_DOUBLINGS = {False: (5.0, 7.0), True: (1.5, 4.5)}
 """Least and largest gain in dB for one doubling, which is multiplied by the root of their number, by whether
 the scene is unbounded. From 400 steps to the end of 2 to 12 minutes it was 5.6 with lego, 6.7 to 7.0 with the
 built-in scene, 4.1 with fox and 1.5 with can (docs/notes/2026-11-28-rays-and-steps.md)."""
 LATER_STEP = {False: 1.0, True: 0.45}
 """Mean time of the later steps, in units of that of a step at EXPECTED_AT, by whether the scene is unbounded:
-rays through contracted space have fewer and fewer samples as surfaces form."""
+rays through contracted space have fewer and fewer samples as surfaces form. It holds for the first FOG_STEPS
+steps, in which each ray has its full number of samples."""
 LARGER_BATCH = {False: 0.6, True: 1.0}
 """Additional time of a batch of twice the first size, in steps of the first size, by whether the scene is
 unbounded. It is below 1 for objects: the more samples, the more of them share rows of the table."""
@@ -66,25 +74,41 @@ def steps_of(time: float, unbounded: bool) -> int:
 
 
 def expectation(
-    psnr: float, seconds: float, seconds_a_step: float, n_steps: int, minutes: float, unbounded: bool
+    psnr: float | None,
+    step: int,
+    seconds: float,
+    seconds_a_step: float,
+    n_steps: int,
+    minutes: float,
+    unbounded: bool,
+    on_cpu: bool = True,
 ) -> str:
-    """Say what to expect of a training that ends after `n_steps` or `minutes`. It has `psnr` dB after
-    EXPECTED_AT steps, which took `seconds` in all, most of them to compile code, and `seconds_a_step` each at
-    the end.
+    """Say what to expect of a training that ends after `n_steps` or `minutes`. Its first `step` steps took
+    `seconds` in all, some of them to compile code, and the last of these steps `seconds_a_step` each. `psnr`:
+    that after EXPECTED_AT steps in dB, None if it is not known.
 
-    >>> expectation(18.0, 30.0, 0.025, 1_000_000, 10.0, False)
+    >>> expectation(18.0, 400, 30.0, 0.025, 1_000_000, 10.0, False)
     '25 ms a step: about 18,000 steps in 10 minutes at most, which give scenes like this 30 to 34 dB'
+    >>> expectation(None, 200, 40.0, 0.025, 20_000, math.inf, False, on_cpu=False)
+    '25 ms a step: about 20,000 steps in 8.9 minutes at most'
     """
-    seconds_a_step *= LATER_STEP[unbounded]
-    later = (60 * minutes - seconds) / seconds_a_step
-    possible = min(n_steps, EXPECTED_AT + steps_of(later, unbounded))
+    if on_cpu and step < FOG_STEPS:
+        seconds_a_step *= LATER_STEP[unbounded]
+    left = (60 * minutes - seconds) / seconds_a_step
+    if on_cpu:
+        done = grown(step, unbounded)
+        size = grown(step + 1, unbounded) - done
+        possible = min(n_steps, max(step, steps_of(done + left * size, unbounded)))
+        later = (grown(possible, unbounded) - done) / size
+    else:  # batches do not grow
+        possible = int(min(n_steps, step + max(left, 0.0)))
+        later = possible - step
+    rounded = round(possible, 1 - len(str(possible)) + 1)
+    taken = min(minutes, (seconds + max(later, 0.0) * seconds_a_step) / 60)
+    minutes_said = f"{taken:.2g}" if taken < 10 else f"{taken:,.0f}"
+    said = f"{1000 * seconds_a_step:.0f} ms a step: about {rounded:,} steps in {minutes_said} minutes at most"
+    if psnr is None:
+        return said
     doublings = max(0.0, math.log2(possible / EXPECTED_AT))
     low, high = (round(psnr + gain * math.sqrt(doublings)) for gain in DB_OF_DOUBLINGS[unbounded])
-    rounded = round(possible, 1 - len(str(possible)) + 1)
-    later = grown(max(possible - EXPECTED_AT, 0), unbounded)
-    taken = min(minutes, (seconds + later * seconds_a_step) / 60)
-    minutes_said = f"{taken:.2g}" if taken < 10 else f"{taken:,.0f}"
-    return (
-        f"{1000 * seconds_a_step:.0f} ms a step: about {rounded:,} steps in {minutes_said} minutes at most, "
-        f"which give scenes like this {low} to {high} dB"
-    )
+    return f"{said}, which give scenes like this {low} to {high} dB"

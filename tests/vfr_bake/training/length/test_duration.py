@@ -14,7 +14,7 @@ from vfr_bake.config import Effort, TrainConfig
 from vfr_bake.data.demo import demo_scene, demo_views
 from vfr_bake.data.witnesses import choose_witnesses
 from vfr_bake.training.length.duration import FIRST_LOOK, GROWTH, Duration
-from vfr_bake.training.length.expectation import expectation, typical_step
+from vfr_bake.training.length.expectation import LATER_STEP, expectation, grown, typical_step
 from vfr_bake.training.length.witness_loss import WitnessLoss
 from vfr_bake.training.trainer import Trainer
 
@@ -96,9 +96,9 @@ def test_a_training_whose_error_is_flat_stops_and_says_so(monkeypatch: pytest.Mo
 
 
 def test_the_expectation_counts_the_steps_that_come_first() -> None:
-    assert "about 1,000 steps in 0.42 minutes" in expectation(18.0, 10.0, 0.025, 1000, 10.0, False)
-    assert "about 400 steps" in expectation(18.0, 10.0, 0.025, 400, 10.0, False)
-    assert "18 to 18 dB" in expectation(18.0, 10.0, 0.025, 10, 10.0, False)
+    assert "about 1,000 steps in 0.42 minutes" in expectation(18.0, 400, 10.0, 0.025, 1000, 10.0, False)
+    assert "about 400 steps" in expectation(18.0, 400, 10.0, 0.025, 400, 10.0, False)
+    assert "18 to 18 dB" in expectation(18.0, 400, 10.0, 0.025, 10, 10.0, False)
 
 
 @pytest.mark.parametrize(
@@ -121,7 +121,7 @@ def test_what_is_expected_is_what_was_reached(
 ) -> None:
     """Steps and PSNR are about those expected. The measured ones, with PSNR on test views, are of two
     trainings of objects on two cores with AVX2 and of two trainings of captures with AVX-512."""
-    said = expectation(psnr, seconds, seconds_a_step, 1_000_000, minutes, unbounded)
+    said = expectation(psnr, 400, seconds, seconds_a_step, 1_000_000, minutes, unbounded)
     found = re.search(r"about ([\d,]+) steps .* (\d+) to (\d+) dB", said)
     assert found
     steps, low, high = (int(number.replace(",", "")) for number in found.groups())
@@ -129,20 +129,39 @@ def test_what_is_expected_is_what_was_reached(
     assert low - 0.5 <= reached <= high + 0.5, "both are rounded"
 
 
+@pytest.mark.parametrize("unbounded", [False, True])
+def test_a_training_that_goes_on_is_expected_to_end_as_it_was_before(unbounded: bool) -> None:
+    """The steps of a later run are longer by the growth of the batches, and shorter by what surfaces save."""
+
+    def steps(step: int, seconds: float, seconds_a_step: float) -> int:
+        said = expectation(None, step, seconds, seconds_a_step, 1_000_000, 12.0, unbounded)
+        found = re.search(r"about ([\d,]+) steps in 12 minutes at most$", said)
+        assert found
+        return int(found[1].replace(",", ""))
+
+    first = 0.02 / LATER_STEP[unbounded]
+    whole = steps(200, 30.0, first)
+    assert whole == pytest.approx(steps(400, 34.0, first), rel=0.1)
+    for step in (5000, 9000):
+        size = grown(step + 1, unbounded) - grown(step, unbounded)
+        seconds = 30.0 + 0.02 * (grown(step, unbounded) - 200)
+        assert steps(step, seconds, 0.02 * size) == pytest.approx(whole, rel=0.1)
+
+
 @pytest.mark.parametrize(("minutes", "said"), [(0.5, "0.5"), (2.25, "2.2"), (120.0, "120"), (1e4, "10,000")])
 def test_minutes_are_said_in_two_digits_or_whole(minutes: float, said: str) -> None:
-    text = expectation(18.0, 10.0, 0.025, 10**9, minutes, False)
+    text = expectation(18.0, 400, 10.0, 0.025, 10**9, minutes, False)
     assert f" steps in {said} minutes at most" in text
 
 
 def test_the_expectation_leaves_out_the_time_that_compiling_took() -> None:
-    assert "about 1,000 steps in 2 minutes" in expectation(18.0, 90.0, 0.05, 1_000_000, 2.0, False)
+    assert "about 1,000 steps in 2 minutes" in expectation(18.0, 400, 90.0, 0.05, 1_000_000, 2.0, False)
 
 
 def test_a_clock_that_moves_on_rarely_still_tells_a_time() -> None:
     ticks = [16e-3 * (step // 4) for step in range(101)]
     assert typical_step(ticks) == pytest.approx(4e-3)
-    assert "ms a step" in expectation(18.0, 10.0, typical_step([10.0] * 101), 1000, 10.0, False)
+    assert "ms a step" in expectation(18.0, 400, 10.0, typical_step([10.0] * 101), 1000, 10.0, False)
 
 
 def test_efforts_are_minutes_at_most() -> None:
