@@ -33,13 +33,22 @@ def check_model_target(path: Path, force: bool) -> None:
         )
 
 
+def check_preview_target(path: Path, force: bool) -> None:
+    """Raise OutputError if the preview of a training cannot be written to `path`. With `force`, an earlier
+    preview or an empty file is replaced, and nothing else."""
+    from vfr_bake.training.preview import MARK
+
+    check_target(path, force, is_file=True)
+    if has_content(path) and MARK.encode() not in _beginning(path):
+        raise OutputError(
+            f"{path}: expected a new file or an earlier preview, got another file: name another model"
+        )
+
+
 def check_page_target(path: Path, force: bool, mark: str | None = None) -> None:
     """Raise OutputError if a web page cannot be written to `path`. With `force`, or if it has the `mark` near
     its beginning, a page is replaced; with `force`, an empty file, too; and nothing else."""
-    begin = b""
-    if path.is_file():
-        with path.open("rb") as file:
-            begin = file.read(200)
+    begin = _beginning(path)
     check_target(path, force or (mark is not None and mark.encode() in begin), is_file=True)
     if has_content(path) and not begin.lower().startswith(b"<!doctype"):
         raise OutputError(f"{path}: expected a new file or an earlier page, got another file: name a new one")
@@ -71,6 +80,14 @@ def check_pictures_target(folder: Path, data: str) -> None:
     check_target(folder / "0.png", force=True, is_file=True)
     if data != "demo" and folder.resolve().is_relative_to(Path(data).resolve()):
         raise OutputError(f"{folder}: --pictures: expected a folder outside {data}, which is read")
+
+
+def _beginning(path: Path) -> bytes:
+    """Return the first bytes of a file; none of what is no file."""
+    if not path.is_file():
+        return b""
+    with path.open("rb") as file:
+        return file.read(200)
 
 
 def _is_model(path: Path) -> bool:

@@ -14,12 +14,17 @@ from typing import TYPE_CHECKING, Any
 
 from player.app.commands import write_result
 from player.errors import MissingExtraError, OutputError, VfrError
-from player.files.files import check_target, write_bytes
+from player.files.files import write_bytes
 from player.progress import Bar, Bars
 from player.terminal import printable
 from vfr_bake.commands.ctrl_c import CtrlC
 from vfr_bake.commands.evaluate import finite
-from vfr_bake.commands.targets import check_json_target, check_model_target, check_page_target
+from vfr_bake.commands.targets import (
+    check_json_target,
+    check_model_target,
+    check_page_target,
+    check_preview_target,
+)
 from vfr_bake.config import TrainConfig
 
 if TYPE_CHECKING:
@@ -64,7 +69,7 @@ def train_command(options: Any) -> int:
     check_model_target(options.model, options.force or goes_on)
     check_json_target(options.json, [], options.model)
     if options.preview:
-        check_target(preview_path(options.model), options.force or options.resume, is_file=True)
+        check_preview_target(preview_path(options.model), options.force or options.resume)
     config = options.config
     choose_device(config.device)  # reports at once that there is no GPU, not after the cameras
     processes = Processes.from_environment()

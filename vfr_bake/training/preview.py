@@ -9,7 +9,8 @@ import numpy as np
 from PIL import Image
 
 from player.errors import OutputError
-from player.files.images import to_8_bit, write_png
+from player.files.files import write_bytes
+from player.files.images import png_bytes, to_8_bit
 from vfr_bake.data.scene import Scene
 from vfr_bake.data.witnesses import whole_views
 from vfr_bake.rendering.render import render_image
@@ -20,6 +21,9 @@ SECONDS = 60.0
 """Seconds of training between two previews."""
 SIDE = 320
 """Pixels of a preview's longest side, at most: such a picture takes a second or two."""
+
+MARK = "preview of vfr-train"
+"""Text near the beginning of every preview: a PNG file without it is another picture, and is not replaced."""
 
 
 def preview_path(model: Path) -> Path:
@@ -64,4 +68,4 @@ class Preview:
         """
         rgb = render_image(trainer.field, trainer.sampler, self._camera, self._background)
         with suppress(OutputError):
-            write_png(self._path, comparison(self._photograph, rgb))
+            write_bytes(self._path, png_bytes(comparison(self._photograph, rgb), MARK))

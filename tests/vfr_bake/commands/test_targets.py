@@ -62,6 +62,19 @@ def test_training_replaces_no_photograph(photographs: Path, capsys: pytest.Captu
     assert content(photographs) == before
 
 
+@pytest.mark.parametrize("option", ["--force", "--resume"])
+def test_a_preview_replaces_no_other_picture(
+    option: str, photographs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    preview = tmp_path / "model.preview.png"
+    Image.new("RGB", (30, 10)).save(tmp_path / "other.png")
+    for data in (b"notes", (tmp_path / "other.png").read_bytes()):
+        preview.write_bytes(data)
+        assert train_main([str(photographs), str(tmp_path / "model.pt"), "--preview", option]) == 1
+        one_error(capsys, "model.preview.png: expected a new file or an earlier preview, got another file")
+        assert preview.read_bytes() == data
+
+
 def test_models_and_pages_are_replaced_with_force_alone(tmp_path: Path) -> None:
     model, page, empty = tmp_path / "model.pt", tmp_path / "page.html", tmp_path / "empty"
     write_tensors(model, {"format": "vfr-model", "state": torch.zeros(3)})

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
+from vfr_bake.commands.targets import check_preview_target
 from vfr_bake.config import TrainConfig
 from vfr_bake.data.demo import demo_scene
 from vfr_bake.data.scene import Scene
@@ -28,6 +29,7 @@ def test_the_photograph_stands_beside_the_picture_and_what_is_wrong(tmp_path: Pa
     trainer, scene = trained(40)
     path = tmp_path / "a.preview.png"
     Preview(scene, path).write(trainer)
+    check_preview_target(path, force=True)
     photograph, rendered, error = np.split(np.asarray(Image.open(path)), 3, axis=1)
     rgba = scene.test.images[1] / 255
     over_white = rgba[..., :3] * rgba[..., 3:] + 1 - rgba[..., 3:]
