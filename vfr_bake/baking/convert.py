@@ -28,8 +28,9 @@ class Converted:
 
     asset: Asset
     """The asset that was read."""
+    n_bytes_before: int
     n_bytes: int
-    """Bytes of all files of the new asset."""
+    """Bytes of all files of the asset that was read, and of the new one, but the reports."""
     seconds: float
 
 
@@ -83,5 +84,5 @@ def convert(
 
     write_asset(new, manifest, GridArrays(densities, features), head, None, cameras, force, finish)
     tell(STEPS, STEPS)
-    n_bytes = sum(path.stat().st_size for path in new.iterdir())
-    return Converted(asset, n_bytes, time.perf_counter() - begin)
+    n_bytes_before, n_bytes = (sum(file_sizes(folder).values()) for folder in (old, new))
+    return Converted(asset, n_bytes_before, n_bytes, time.perf_counter() - begin)

@@ -82,18 +82,17 @@ def _convert(options: Any) -> int:
         raise ConfigError(f"--convert: expected no other setting than --max-memory, got {sorted(given)}")
     with Bar("converting") as bar:
         done = convert(options.model, options.asset, options.config.memory, options.force, bar.count)
-    before = sum(entry.bytes for entry in done.asset.manifest.files.values())
     version = done.asset.manifest.version
     write_result(
         options.json,
         {
             "asset": str(options.asset),
             "megabytes": done.n_bytes / 1e6,
-            "megabytes_before": before / 1e6,
+            "megabytes_before": done.n_bytes_before / 1e6,
             "version_before": list(version),
             "seconds": done.seconds,
         },
         f"{options.asset}: {done.n_bytes / 1e6:.1f} MB, rewritten from {options.model} (version "
-        f"{version[0]}.{version[1]}, {before / 1e6:.1f} MB) in {done.seconds:.0f} s",
+        f"{version[0]}.{version[1]}, {done.n_bytes_before / 1e6:.1f} MB) in {done.seconds:.0f} s",
     )
     return 0
