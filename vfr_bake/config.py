@@ -384,7 +384,7 @@ class BakeConfig:
     all the same."""
     max_memory: float | None = None
     """Gigabytes of memory that the bake may take: with less, the bake learns from fewer rays and its grids
-    are coarser. Not given: half of the machine's memory, at most 4, and at least 0.85, which any bake needs."""
+    are coarser. Not given: half of the machine's, at most 4 and at least 0.85, which any bake needs."""
     check_views: int = 4
     """Views between the training cameras on which each step of the bake is compared with the model's own
     pictures; 1 to 1,000; the more views, the fewer pixels of each are compared."""

@@ -41,7 +41,7 @@ class Loss(NamedTuple):
     """Standard error in dB; None if the loss is not measured but expected."""
     widening: float = 0.0
     """dB by which the standard error is stated wider, because some of it is estimated from few views. Choices
-    do not take it into account."""
+    do not take it into account; warnings do."""
 
     @property
     def stated(self) -> float | None:
@@ -60,8 +60,8 @@ class Loss(NamedTuple):
 
     @property
     def least(self) -> float:
-        """A likely lower bound of the loss in dB: one standard error below what was measured."""
-        return self.db - (self.spread or 0.0)
+        """A likely lower bound of the loss in dB: one stated standard error below what was measured."""
+        return self.db - (self.stated or 0.0)
 
     def __str__(self) -> str:
         if self.stated is None:
