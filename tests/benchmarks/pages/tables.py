@@ -334,6 +334,20 @@ def _compared_views(results: Results, name: str) -> str:
     return f"{min(asked, scored['figures']['n_views'])}" if scored else ""
 
 
+def viewers(results: Results) -> list[str]:
+    """Return the table of Open3D, which draws the mesh, beside `vfr-play`."""
+    there, lacking = present(results, ["viewers_lego"])
+    rows = []
+    for name in there:
+        found = results[name]["figures"]
+        for row in found["rows"]:
+            cells = [row["what"], where(results, name), rate(row["ms"], row["uncertainty"])]
+            cells += [number(row["processor_ms"], 0), number(row["psnr"], 2), megabytes(row["n_bytes"])]
+            rows.append(cells)
+    titles = ["lego, balanced, drawn by", "machine, commit", "frames a second", "processor time, ms"]
+    return titled([*titles, "PSNR, dB", "MB"], rows, lacking)
+
+
 def frame_parts(results: Results) -> list[str]:
     """Return the table of where the time of an exact frame goes, and of the time to the first picture."""
     needed = [f"trade_{scene}" for scene in SCENES]
@@ -444,6 +458,7 @@ BLOCKS: dict[str, Block] = {
     "lookups": lookups,
     "page": page,
     "playing": playing,
+    "viewers": viewers,
     "frame-parts": frame_parts,
     "exporting": exporting,
     "specks": specks,

@@ -165,6 +165,14 @@ def _more() -> list[Part]:
         Part("cameras_ring", played.ring, 20.0, core=False),
         Part("compositing_lego", played.compositing, 9.0, ("compiled",), "lego_400", core=False),
         Part("steps_lego", played.steps, 6.0, ("compiled",), "lego_400", core=False),
+        Part(
+            "viewers_lego",
+            partial(played.viewers, scene=LEGO, asset_of="bake_lego_balanced"),
+            2.0,
+            ("bake_lego_balanced",),
+            LEGO.data,
+            core=False,
+        ),
         Part("specks_lego", played.specks, 4.0, ("train_lego", "bake_lego_balanced"), core=False),
     ]
 

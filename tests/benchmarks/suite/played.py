@@ -92,6 +92,15 @@ def page(work: Work, asset_of: str) -> dict[str, Any]:
     return work.read("page.json")
 
 
+def viewers(work: Work, scene: Scene, asset_of: str) -> dict[str, Any]:
+    """Measure Open3D, which draws an asset's exported mesh, and `vfr-play`, frame by frame in turns."""
+    asset, mesh = work.file(asset_of, "asset"), work.folder / "mesh.ply"
+    work.command("vfr-export", asset, mesh)
+    little = ("--frames", work.little(20, 2), "--views", work.little(8, 1))
+    words = ("--data", data_of(work, scene), "--size", work.little(scene.size, "24x24"), *little)
+    return _script(work, "peers.open3d_mesh", asset, mesh, *words)
+
+
 def cameras(work: Work, data: str) -> dict[str, Any]:
     """Compare estimated cameras with known ones; of a rendered ring if the machinery is tried out."""
     if work.quick:

@@ -140,6 +140,14 @@ def test_losses_name_the_number_of_test_views() -> None:
         assert lines[3].endswith("| 0.4 GB |  |  |  |")
 
 
+def test_another_viewer_stands_beside_ours() -> None:
+    row = {"what": "Open3D, mesh", "ms": 80.0, "uncertainty": 2.0, "processor_ms": 151.2, "psnr": 24.567}
+    found = {"size": [800, 800], "n_views": 8, "n_faces": 9, "rows": [row | {"n_bytes": 4.94e6}]}
+    assert BLOCKS["viewers"]({"viewers_lego": result(found)})[2:] == [
+        "| Open3D, mesh | A, 0a1b2c3 | 12.5 ± 0.3 | 151 | 24.57 | 4.9 |"
+    ]
+
+
 def test_lookups_are_shown_with_the_bytes_of_the_assets() -> None:
     scores = {f"{name}, seed {seed}": {k: [30.0, 31.0, 32.0] for k in LOOKUPS}
               for name in ("every", "k5") for seed in range(3)}  # fmt: skip
