@@ -23,13 +23,14 @@ import numpy as np
 
 from player.asset.asset import Asset
 from player.cameras.camera import Camera
+from player.cameras.views import asset_cameras
 from player.errors import ConfigError, MissingExtraError
 from player.files.images import to_8_bit
 from player.files.json_files import brief
 from player.head.head import Head
 from player.march.bounds import block_bounds
 from player.march.interpolation import OPAQUE_DEPTH, MarchStage, Quality, interpolate, stages
-from player.march.march import MarchResult
+from player.march.march import MAX_TAU, MarchResult
 from player.march.normals import composited_normals
 from player.march.pixels import EVERY, Planes, write_pixels
 from player.march.view import View
@@ -54,6 +55,9 @@ TASKS_A_THREAD = {"numba": 8, "numpy": 1}
 """Least number of tasks per thread, if there are enough blocks, so that the work is shared out evenly. For
 numpy it is 1: a call of numpy takes as long for ten rays as for a hundred, and threads wait for one another
 between calls."""
+LEAST_IN_STAGES = 0.5
+"""Least size, as a share of the training size, at which pixels are interpolated. In smaller pictures so few
+neighbours agree that it takes longer than to march all pixels."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,19 +183,22 @@ class Renderer:
             background: colour 0..1 or "transparent"; the asset's own if None.
             quality: "exact" marches every pixel; "high" and "fast" interpolate pixels between neighbours that
                 agree (`player.march.interpolation`), fetch features at fewer positions and end rays earlier,
-                as far as the asset's `agreement` and `quality_fetches` allow.
+                as far as the asset's `agreement` and `quality_fetches` allow, and less so in pictures that
+                are smaller than those of training.
             layers: compute the frame's `features` and `normals` at once, at the cost of a second march; the
                 picture is the same.
 
         Raises:
             ConfigError: a picture over MAX_PIXELS, a setting out of range, or a renderer that is closed.
+            FormatError, IntegrityError: the asset's cameras, which a quality other than "exact" needs, are
+                damaged or not there any more.
         """
         if self._closed:
             raise ConfigError("renderer: expected an open one, got one that was closed: make another")
         check_size(camera.width, camera.height)
         background = checked_background(self.asset.manifest.background if background is None else background)
         k = fetches_used(self.asset, n_fetches, quality)
-        reduced = _reduced(self.asset, quality)
+        reduced = _reduced(self.asset, quality, 1.0 if quality == "exact" else self._scale(camera))
         picture = self._blank(camera, background, k, reduced.opaque_depth, layers)
         for stage in stages(reduced.levels, picture.view.grid.contracted):
             self._in_tasks(picture, stage)
@@ -210,6 +217,17 @@ class Renderer:
         if normals is not None:
             vars(frame)["normals"] = normals  # already known
         return frame
+
+    @cached_property
+    def _focal_length(self) -> float:
+        """Focal length of the training cameras in pixels."""
+        return float(np.median([camera.fx for camera in asset_cameras(self.asset)]))
+
+    def _scale(self, camera: Camera) -> float:
+        """Return the size of a picture as a share of the training size, 1 at most. An asset that the bake has
+        not written yet has no cameras; pictures of it count as if they had the training size."""
+        known = "cameras.json" in self.asset.manifest.files
+        return min(camera.fx / self._focal_length, 1.0) if known else 1.0
 
     def _blank(
         self,
@@ -327,13 +345,21 @@ def fetches_used(asset: Asset, n_fetches: int | None = None, quality: Quality = 
     return min(k, asset.most_samples)
 
 
-def _reduced(asset: Asset, quality: Quality) -> _Reduced:
-    """Return the reductions of a quality, as far as the asset allows them."""
+def _reduced(asset: Asset, quality: Quality, scale: float = 1.0) -> _Reduced:
+    """Return the reductions of a quality, as far as the asset allows them.
+
+    `scale`: the picture's size as a share of the training size, 1 at most. The bake chose the reductions at
+    the training size. In a smaller picture, neighbours lie farther apart in the scene, and the same
+    reductions lose more. So the levels, and the light that is left where rays end, are in proportion.
+    """
     levels, n_fetches, manifest = 0.0, 0, asset.manifest
     if quality != "exact":
         number = ("high", "fast").index(quality)
         levels, n_fetches = manifest.agreement[number], (manifest.quality_fetches or (0, 0))[number]
-    return _Reduced(levels, n_fetches, OPAQUE_DEPTH[quality if levels or n_fetches else "exact"])
+    if not levels and not n_fetches:
+        return _Reduced(0.0, 0, MAX_TAU)
+    depth = min(OPAQUE_DEPTH[quality] - math.log(scale), MAX_TAU)
+    return _Reduced(levels * scale * (scale >= LEAST_IN_STAGES), n_fetches, np.float32(depth))
 
 
 def check_size(width: int, height: int) -> None:

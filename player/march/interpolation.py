@@ -36,7 +36,8 @@ OPAQUE_DEPTH: dict[Quality, np.float32] = {
     "high": np.float32(np.log(25)),
     "fast": np.float32(np.log(10)),
 }
-"""The optical depth at which rays stop, for pictures of each quality (`player.march.march.march`)."""
+"""The optical depth at which rays stop, for pictures of each quality (`player.march.march.march`). The
+renderer raises it for pictures that are smaller than those of training."""
 OF_FIRST_HALVING = 0.6
 """Factor on the levels by which pixels may differ, in the first halving of a lattice of every fourth
 pixel."""
