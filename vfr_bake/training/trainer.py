@@ -251,8 +251,9 @@ class Trainer:
             yield StepReport(step, progress, loss, n_rays, n_samples, self.seconds)
 
     def _look(self, step: int, seconds: float) -> None:
-        """Shorten the training if the error is flat; the first process decides for all."""
-        if self.processes.first and self._looks and not self._is_unclear:
+        """Shorten the training if the error is flat; the first process decides for all. The error of a head
+        that does not learn yet says nothing."""
+        if self.processes.first and self._looks and self.head_learns and not self._is_unclear:
             self.duration.look(step, seconds, self._measured)
 
     def _measured(self) -> tuple[WitnessLoss, np.ndarray]:

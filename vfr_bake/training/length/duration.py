@@ -3,10 +3,10 @@ nothing more to teach.
 
 The learning rate is high for the first half of a training and falls in the second
 (`vfr_bake.training.optimiser.rate_factor`). While it is high, the error is measured at the witnesses, pixels
-that are not learned from: FIRST_LOOK seconds after the start, and then whenever the time has grown by the
-factor GROWTH. So the time has doubled after every two looks. If the last doubling has gained less than
-FLAT_DB, twice in a row and beyond chance, another one is not worth it: the second half of the training begins
-at once, and takes as long as the first did.
+that are not learned from: FIRST_LOOK seconds after the start, or after FIRST_SHARE of the training if that is
+less, and then whenever the time has grown by the factor GROWTH. So the time has doubled after every two
+looks. If the last doubling has gained less than FLAT_DB, twice in a row and beyond chance, another one is not
+worth it: the second half of the training begins at once, and takes as long as the first did.
 """
 
 from __future__ import annotations
@@ -22,7 +22,10 @@ from vfr_bake.training.length.witness_loss import WitnessLoss
 from vfr_bake.training.optimiser import HELD
 
 FIRST_LOOK = 60.0
-"""Seconds of training before the first look."""
+"""Seconds of training before the first look, at most."""
+FIRST_SHARE = 0.1
+"""Share of the training before the first look, at most. Four looks, the fewest that shorten a training, then
+fit into its first half."""
 GROWTH = math.sqrt(2)
 """Factor between the times of two looks."""
 LOOKS_OF_A_DOUBLING = 2
@@ -46,7 +49,7 @@ class Duration:
         infinite."""
         self._steps = steps
         self._seconds = 60 * minutes
-        self._next_look = FIRST_LOOK
+        self._next_look = min(FIRST_LOOK, FIRST_SHARE * self._seconds)
         self._errors: list[np.ndarray] = []
         """Errors [n_witnesses] at each of the last LOOKS_OF_A_DOUBLING looks."""
         self._n_flat = 0

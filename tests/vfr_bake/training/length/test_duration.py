@@ -6,6 +6,7 @@ import itertools
 import math
 import re
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -22,8 +23,11 @@ CHOSEN = choose_witnesses(demo_views(32, 24, 1)[0])
 WITNESSES, N = WitnessLoss(CHOSEN, np.ones(3)), len(CHOSEN.pixels)
 
 
-def looks(duration: Duration, gain_of_a_doubling: float, n: int, noise: float = 0.0) -> list[float]:
-    """Let the error fall by so many dB with each doubling of the time; return the times [s] of `n` looks."""
+def looks(
+    duration: Duration, gain_of_a_doubling: float, n: int, noise: float = 0.0, first: float = FIRST_LOOK
+) -> list[float]:
+    """Let the error fall by so many dB with each doubling of the time; return the times [s] of `n` looks, the
+    first of which is due after `first` seconds."""
     random = np.random.default_rng(0)
     times, now = [], 0.0
 
@@ -33,7 +37,7 @@ def looks(duration: Duration, gain_of_a_doubling: float, n: int, noise: float = 
         return WITNESSES, errors * np.exp(noise * random.normal(size=N))
 
     for number in range(n):
-        now = FIRST_LOOK * GROWTH**number * (1 + 1e-9 * number)  # not too early, even after rounding
+        now = first * GROWTH**number * (1 + 1e-9 * number)  # not too early, even after rounding
         duration.look(1, now - 1e-3, measure)  # too early for a look
         duration.look(1, now, measure)
     return times
@@ -63,7 +67,19 @@ def test_one_flat_look_is_chance_and_so_is_an_error_that_varies_as_much() -> Non
 def test_nobody_looks_in_the_second_half() -> None:
     duration = Duration(10**6, 4.0)
     assert looks(duration, 0.0, 2) and not duration.ended_early
-    assert len(looks(Duration(10**6, 2.0), 0.0, 5)) == 0
+    assert len(looks(Duration(10**6, 2.0), 0.0, 5, first=60.1)) == 0
+
+
+@pytest.mark.parametrize("minutes", [0.5, 2.0, 10.0])
+def test_a_short_training_ends_early_too(minutes: float) -> None:
+    """As `--effort draft` does, which takes 2 minutes."""
+    first = 6 * minutes
+    flat, falling = Duration(10**6, minutes), Duration(10**6, minutes)
+    times = looks(flat, 0.0, 4, first=first)
+    assert len(times) == 4 and times[0] == first
+    assert flat.ended_early and math.isclose(flat.progress(1, times[-1]), 0.5)
+    looks(falling, 3.0, 4, first=first)
+    assert not falling.ended_early
 
 
 def test_what_was_seen_is_kept_and_the_length_may_change() -> None:
@@ -86,13 +102,18 @@ def test_a_training_whose_error_is_flat_stops_and_says_so(monkeypatch: pytest.Mo
     monkeypatch.setattr("vfr_bake.training.trainer.time", SimpleNamespace(monotonic=lambda: next(clock)))
     monkeypatch.setattr("vfr_bake.training.length.duration.FIRST_LOOK", 6.0)
     scene = demo_scene(size=32, n_train=20, n_test=1)
-    settings = {"minutes": 20.0, "grid_rate": 1e-9, "network_rate": 1e-9, "batch_samples": 1024}
-    trainer = Trainer(scene, TrainConfig(device="cpu", **settings))
+    settings: dict[str, Any] = {
+        "minutes": 20.0, "grid_rate": 1e-9, "network_rate": 1e-9, "batch_samples": 1024, "device": "cpu"
+    }  # fmt: skip
+    trainer = Trainer(scene, TrainConfig(pilot_steps=3, **settings))
     reports = list(trainer.run())
     assert trainer.duration.ended_early
     assert reports[-1].progress < 1 and reports[-1].seconds < 100
-    asked = Trainer(scene, TrainConfig(device="cpu", steps=60, **settings))
+    asked = Trainer(scene, TrainConfig(steps=60, pilot_steps=3, **settings))
     assert len(list(asked.run())) == 60 and not asked.duration.ended_early
+    # While the pilot network learns, the head's error is flat, but says nothing.
+    pilot = Trainer(scene, TrainConfig(pilot_steps=1000, **settings))
+    assert len(list(itertools.islice(pilot.run(), 60))) == 60 and not pilot.duration.ended_early
 
 
 def test_the_expectation_counts_the_steps_that_come_first() -> None:
