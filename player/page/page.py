@@ -112,8 +112,9 @@ def page_of_one_file(
     before, behind = _around_data(
         asset, title, poster=f"data:image/jpeg;base64,{poster}", advice="", img="", connect="'none'"
     )
-    content = before + data_elements(scene_files(asset)) + behind
-    return WebPage({INDEX: content}, len(before) + len(behind) - len(poster), n_gpu)
+    files = scene_files(asset)
+    n_around = len(before + data_elements(dict.fromkeys(files, b"")) + behind) - len(poster)
+    return WebPage({INDEX: before + data_elements(files) + behind}, n_around, n_gpu)
 
 
 def page_of_many_files(asset: Asset, title: str | None = None, max_gpu_mb: int | None = None) -> WebPage:
@@ -200,8 +201,8 @@ def _behind(asset: Asset) -> str:
 
 
 def web_files() -> dict[str, str]:
-    """Read the modules, the style and the page itself, by file name, without comments and with the shaders as
-    `shaders.js`."""
+    """Read the modules, the style and the page itself, by file name, without comments and needless spaces,
+    and with the shaders as `shaders.js`."""
     folder = resources.files("player.page") / "web"
     files = {file.name: file.read_text(encoding="utf-8") for file in folder.iterdir() if file.is_file()}
     found = {name: _stripped(name, text) for name, text in sorted(files.items())}
@@ -223,7 +224,9 @@ def data_elements(files: Mapping[str, bytes]) -> bytes:
 
 
 def _stripped(name: str, text: str) -> str:
-    return without_comments(text) if name.endswith((".js", ".glsl", ".css")) else text
+    if name.endswith(".css"):
+        return re.sub(r"(?<=[{}:;,])\s+", "", without_comments(text))
+    return without_comments(text) if name.endswith((".js", ".glsl")) else text
 
 
 def page_script(files: Mapping[str, str], begin: str = "main.js", worker: str = "worker.js") -> str:

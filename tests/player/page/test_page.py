@@ -20,6 +20,7 @@ import pytest
 from playwright.sync_api import Browser, Page, Route
 
 from exporters.export import export_asset
+from player.app.option_types import DEMO
 from player.asset.asset import Asset
 from player.errors import ConfigError, FormatError
 from player.page import page
@@ -164,12 +165,17 @@ def test_a_page_is_plain_and_names_what_runs(asset: Asset, make: Callable[..., W
     assert sum(map(len, made.files.values())) < 1.35 * (data + made.viewer_bytes + 50_000)
 
 
-def test_the_viewer_is_small(asset: Asset) -> None:
+def test_the_viewer_is_small() -> None:
+    """The viewer is small: all of a page but the poster's text and those of the data."""
+    asset = Asset.open(DEMO)
     one, many = page_of_one_file(asset), page_of_many_files(asset)
+    text = one.files["index.html"]
+    found = re.findall(rb'data:image/jpeg;base64,([^"]*)|<script[^>]* data-file="[^>]*>([^<]*)<', text)
+    assert len(found) == 1 + len(scene_files(asset))
+    assert len(text) - sum(len(some) for each in found for some in each) == one.viewer_bytes <= MOST_VIEWER
     others = {name: data for name, data in many.files.items() if name not in scene_files(asset)}
     del others["poster.jpg"]
     assert sum(map(len, others.values())) == many.viewer_bytes <= MOST_VIEWER
-    assert one.viewer_bytes <= MOST_VIEWER
 
 
 def test_a_title_may_hold_what_the_page_fills_in(asset: Asset) -> None:
