@@ -200,7 +200,12 @@ class _Bake:
             data = small_ply_bytes(mesh)
             report = self._judge(asset, file_sizes(new) | {"mesh.ply": len(data)}, folder.name)
             made.append(report)
-            return {"mesh.ply": data, "report.json": report.json(), "report.html": report.html()}
+            files = report.with_files(replace(asset.manifest, provenance=manifest.provenance), data)
+            timed = self.config.target_ms is not None
+            ms = frame_ms(asset, self.model.cameras[0], self.n_fetches) if timed else None
+            loss, megabytes = self.held_out.stages[-1].loss, sum(report.n_bytes.values()) / 1e6
+            check_budget(self.config, loss, megabytes, ms)
+            return files
 
         with self._part(LAST_PART):
             manifest = replace(manifest, provenance=manifest.provenance | {"baked": figures})
@@ -455,14 +460,8 @@ class _Bake:
         return asdict(self.config) | asdict(self.choice) | {"max_memory": self.config.memory}
 
     def _judge(self, asset: Asset, n_bytes: dict[str, int], name: str) -> BakeReport:
-        """Play the written files, which have the sizes `n_bytes`, and report the result. Raises TrainingError
-        if it misses a limit that was asked for."""
-        head = Head.of(asset)
-        last = self.held_out.measure("files", asset.grid, head, self.n_fetches)
-        megabytes = sum(n_bytes.values()) / 1e6
-        timed = self.config.target_ms is not None
-        ms = frame_ms(asset, self.model.cameras[0], self.n_fetches) if timed else None
-        check_budget(self.config, last.loss, megabytes, ms)
+        """Play the written files, which have the sizes `n_bytes`, and report the result."""
+        last = self.held_out.measure("files", asset.grid, Head.of(asset), self.n_fetches)
         preset = self.choice.preset
         gpu_bytes, missed = page_memory(asset, preset)
         if last.loss.spread is None:

@@ -8,13 +8,14 @@ from __future__ import annotations
 import base64
 import json
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from html import escape
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from player.asset.asset import Asset
+from player.asset.manifest import Manifest, file_entry, manifest_bytes
 from player.files.images import png_bytes
 from player.render import Renderer
 from vfr_bake.baking.held_out import views_between
@@ -67,7 +68,7 @@ class BakeReport:
     measured_on: str
     """Description of what the losses are measured on, or estimated from."""
     n_bytes: dict[str, int]
-    """Bytes of each file."""
+    """Bytes of each of the asset's files but the report."""
     seconds: dict[str, float]
     """Wall-clock seconds of each part of the bake."""
     left_out: dict[str, str]
@@ -81,6 +82,19 @@ class BakeReport:
     """Bytes of graphics memory that a page of the asset takes; None if there can be no page of it."""
     pictures: list[Pictures] = field(default_factory=list)
     """Pictures of the full model and of the asset."""
+
+    def with_files(self, manifest: Manifest, mesh: bytes) -> dict[str, bytes]:
+        """Return the files that complete an asset, by name: its mesh and this report.
+
+        `manifest` is that of the asset without them. Its size in `n_bytes` becomes that of the file that also
+        lists them.
+        """
+        files = {"mesh.ply": mesh}
+        for _ in range(2):  # the manifest lists the report, which states the size of the manifest
+            files |= {"report.json": self.json(), "report.html": self.html()}
+            listed = manifest.files | {name: file_entry(data) for name, data in files.items()}
+            self.n_bytes["manifest.json"] = len(manifest_bytes(replace(manifest, files=listed)))
+        return files
 
     def json(self) -> bytes:
         """Return the content of report.json."""

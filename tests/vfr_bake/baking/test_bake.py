@@ -40,6 +40,8 @@ from vfr_bake.baking.distillation import (
 from vfr_bake.baking.grids import code_step, head_sensitivity, latent, project, whole_codes
 from vfr_bake.baking.head import FoldedHead, fold_head, runner
 from vfr_bake.baking.held_out import views_between
+from vfr_bake.baking.limits import file_sizes
+from vfr_bake.baking.plan import FEWEST_MANIFEST_BYTES
 from vfr_bake.baking.refinement import (
     BATCH,
     HEAD_RATE,
@@ -364,7 +366,9 @@ def test_the_asset_plays_what_the_model_shows(model: Model, tmp_path: Path) -> N
     assert lost["files"] - better < allowed + 0.05, "detail and bits are left out by what the witnesses lose"
 
 
-def test_the_report_adds_up(model: Model, tmp_path: Path) -> None:
+def test_the_report_adds_up(model: Model, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    checked = []
+    monkeypatch.setattr("vfr_bake.baking.bake.check_budget", lambda *given: checked.append(given[2]))
     settings = BakeConfig(preset="fast", resolution=64, mesh_resolution=32, refine_steps=20, check_views=2)
     result = bake(model, tmp_path / "asset", settings, quiet)
     said = json.loads((tmp_path / "asset" / "report.json").read_text())
@@ -372,10 +376,9 @@ def test_the_report_adds_up(model: Model, tmp_path: Path) -> None:
     refined = ["refined", "k", "head in 8 bits", "refined at k"]
     names.remove("files")
     assert names == ["grid", "rank", "codes", "small head", *refined][: len(names)] and len(names) >= 7
-    for name, size in said["bytes"].items():
-        if name != "manifest.json":  # lists the reports, which are written after it is counted
-            assert (tmp_path / "asset" / name).stat().st_size == size
-    assert sum(said["bytes"].values()) <= result.n_bytes
+    assert said["bytes"] == file_sizes(tmp_path / "asset"), "the manifest as it lists the reports"
+    assert said["bytes"]["manifest.json"] > FEWEST_MANIFEST_BYTES
+    assert [1e6 * megabytes for megabytes in checked] == [sum(said["bytes"].values())] == [result.n_bytes]
     assert said["seconds"].keys() == result.figures["time"].keys(), "the report's own part is among them"
     assert said["gpu_bytes"] == result.figures["gpu_bytes"] == gpu_bytes(Asset.open(tmp_path / "asset"))
     assert said["asked"]["n_channels"] == PRESETS["fast"].n_channels and "channels" in said["left_out"]

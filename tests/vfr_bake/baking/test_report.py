@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from html.parser import HTMLParser
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from player.asset.asset import read_manifest
+from player.asset.manifest import file_entry, manifest_bytes
 from vfr_bake.baking.held_out import expected_loss
+from vfr_bake.baking.mesh import LISTED_BYTES
 from vfr_bake.baking.report import BakeReport, Pictures, bars
 
 STAGE = {"psnr": 40.0, "loss_db": 0.5, "loss_db_spread": 0.03, "samples_median": 5.0, "samples_p95": 9.0}
@@ -80,6 +85,17 @@ def test_the_json_says_the_same() -> None:
     assert said["measured_on"] == "Measured on <7> pixels."
     with pytest.raises(ValueError, match="not JSON compliant"):
         report(seconds={"grid": float("nan")}).json()
+
+
+def test_the_manifest_is_counted_as_it_lists_the_report(shells_folder: Path) -> None:
+    manifest = read_manifest(shells_folder)
+    before = len(manifest_bytes(manifest))
+    made = report(n_bytes={"manifest.json": before})
+    files = made.with_files(manifest, b"a mesh")
+    listed = manifest.files | {name: file_entry(data) for name, data in files.items()}
+    size = len(manifest_bytes(replace(manifest, files=listed)))
+    assert json.loads(files["report.json"])["bytes"] == made.n_bytes == {"manifest.json": size}
+    assert 200 < size - before < LISTED_BYTES, "the bytes that a mesh leaves for it"
 
 
 def test_a_loss_that_is_not_measured_is_called_expected() -> None:
