@@ -34,10 +34,11 @@ def open_player(folder: str, cameras: str, threads: str, max_memory: str) -> Ans
     share of the machine's memory."""
     from player.asset.asset import Asset
     from player.march.march import MIN_OPACITY
-    from player.render import Renderer
+    from player.render import Renderer, fetches_used
 
     views = read_cameras(Path(cameras))
-    renderer = Renderer(Asset.open(folder, max_memory=float(max_memory) or None), int(threads) or None)
+    asset = Asset.open(folder, max_memory=float(max_memory) or None)
+    renderer = Renderer(asset, int(threads) or None)
     march, head = (Clock(part) for part in (renderer._module.march, renderer._head))
     renderer._module, renderer._head = SimpleNamespace(march=march), head  # type: ignore[assignment]
 
@@ -45,12 +46,13 @@ def open_player(folder: str, cameras: str, threads: str, max_memory: str) -> Ans
         camera = views[request["view"]].resized(*request["size"])
         march.seconds = head.seconds = 0.0
         frame, ms = _timed(lambda: renderer.render(camera, request["samples"], quality=request["quality"]))
+        k = fetches_used(asset, request["samples"], request["quality"])
         taken = frame.n_density_samples[(frame.opacity > MIN_OPACITY) & (frame.n_density_samples > 0)]
         return _kept(request, frame.rgb, frame.opacity) | {
             "ms": ms,
             "march_ms": 1000 * march.seconds / renderer.n_threads,
             "head_ms": 1000 * head.seconds / renderer.n_threads,
-            "fetches": int(np.minimum(taken, request["samples"] or taken).sum()),
+            "fetches": int(np.minimum(taken, k or taken).sum()),
             "samples": float(taken.mean()) if len(taken) else 0.0,
             "march": renderer.march,
             "threads": renderer.n_threads,

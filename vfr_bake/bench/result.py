@@ -24,7 +24,8 @@ class Setting:
     asset: str | None
     """The folder; None for the full model."""
     n_fetches: int | None
-    """Feature lookups per ray, k; 0 for one at every sample. None for the full model."""
+    """The most feature lookups per ray, k, which a quality may lower; 0 for one at every sample. None for the
+    full model."""
     quality: Quality | None
     """Quality setting of the player. None for the full model."""
     what: dict[str, Any]

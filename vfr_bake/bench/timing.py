@@ -1,8 +1,8 @@
 """Frame times, measured in rounds that ask every process in turn, so that a busy minute of the
 machine affects all of them.
 
-A round visits each asset and size once, in random order. A visit renders one view with every k and quality,
-also in random order, after one frame that is not counted. Times are those of whole frames.
+A round visits each asset and size once, in random order. A visit renders one view with every k and quality
+of the asset, also in random order, after one frame that is not counted. Times are those of whole frames.
 
 March and lookups are one loop and cannot be timed apart. For one view, only the lookups differ with k. So a
 slope b is fitted to the march's time against the number of lookups, over the exact frames of each visit, and
@@ -70,13 +70,13 @@ def measure_times(
     players: Sequence[Ask],
     n_views: int,
     sizes: Sequence[Size],
-    dials: Sequence[Dials],
+    dials: Sequence[Sequence[Dials]],
     n_rounds: int,
     until: float,
     progress: Callable[[int, int], object],
 ) -> dict[tuple[int, Dials, Size], Times]:
     """Return the times of every (player, dials, size); each of `players` is a function that asks
-    one process for a frame.
+    one process for a frame, and has its own `dials`.
 
     There are `n_rounds` rounds, or fewer if not all are expected to end before `until`, a time of the clock
     `time.monotonic()`; but at least FEWEST_ROUNDS.
@@ -88,11 +88,11 @@ def measure_times(
     while turn < n_rounds:
         for index in random.permutation(len(places)):
             player, size = places[index]
-            ask = players[player]
+            ask, own = players[player], dials[player]
             request = {"view": turn % n_views, "size": size, "rgb": None}
-            ask(**request, **dials[0].request())
-            order = random.permutation(len(dials))
-            answers = {dials[i]: ask(**request, **dials[i].request()) for i in order}
+            ask(**request, **own[0].request())
+            order = random.permutation(len(own))
+            answers = {own[i]: ask(**request, **own[i].request()) for i in order}
             visits.setdefault((player, size), []).append(answers)
             done += 1
             progress(done, n_rounds * len(places))
@@ -105,7 +105,7 @@ def measure_times(
         slope = lookup_slope(rounds)
         shared = [_mean_ms([visits[other, size][number] for other in range(len(players))])
                   for number in range(turn)]  # fmt: skip
-        for some in dials:
+        for some in dials[player]:
             times[player, some, size] = frame_times([answers[some] for answers in rounds], slope, shared)
     return times
 

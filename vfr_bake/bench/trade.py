@@ -24,8 +24,8 @@ from player.cameras.camera import Camera
 from player.cameras.transforms import write_cameras
 from player.cameras.views import asset_cameras
 from player.errors import ConfigError
-from player.march.interpolation import Quality
 from player.progress import Report
+from player.render import fetches_used
 from player.terminal import command_line
 from player.threads import bounded_threads
 from vfr_bake.baking.report import Pictures
@@ -102,7 +102,7 @@ def measure_trade(config: BenchConfig, lpips: Distance | None, progress: Report)
         run = _Run(Path(folder), views, config, lpips, progress)
         first, frame_seconds = run.first_pictures(list(assets), own)
         scored = len(assets) * (1 if config.model is None else 2)
-        seconds_a_view = len(dials) * (frame_seconds + scored * run.score_seconds())
+        seconds_a_view = len(dials[0]) * (frame_seconds + scored * run.score_seconds())
         run.views = views.first(max(1, int(min(n_views, most_seconds / seconds_a_view))))
         model, full = None, None
         if config.model is not None:
@@ -116,8 +116,8 @@ def measure_trade(config: BenchConfig, lpips: Distance | None, progress: Report)
             )
         players = [stack.enter_context(run.player(name)) for name in assets]
         qualities = [
-            run.quality(name, asset, player, dials, full)
-            for (name, asset), player in zip(assets.items(), players, strict=True)
+            run.quality(name, asset, player, own_dials, full)
+            for (name, asset), player, own_dials in zip(assets.items(), players, dials, strict=True)
         ]
         times = measure_times(
             [player.ask for player in players],
@@ -128,12 +128,12 @@ def measure_trade(config: BenchConfig, lpips: Distance | None, progress: Report)
             begin + 60 * config.minutes,
             lambda done, of: progress("frame times", done, of),
         )
-        played = players[0].ask(view=0, size=own, **dials[0].request(), rgb=None)
+        played = players[0].ask(view=0, size=own, **dials[0][0].request(), rgb=None)
     rows = [
         Setting(
-            name=f"{name} k={some.n_fetches or 'all'}{'' if some.quality == 'exact' else ' ' + some.quality}",
+            name=f"{name} k={k or 'all'}{'' if some.quality == 'exact' else ' ' + some.quality}",
             asset=name,
-            n_fetches=some.n_fetches,
+            n_fetches=k,
             quality=some.quality,
             what=describe(asset),
             scores=qualities[index].scores[some],
@@ -141,10 +141,11 @@ def measure_trade(config: BenchConfig, lpips: Distance | None, progress: Report)
             n_bytes=played_bytes(asset),
             peak_mb=qualities[index].peak_mb,
             first_picture_ms=first[index],
-            commands=(bake_command(name, asset), play_command(name, some.n_fetches, some.quality, own)),
+            commands=(bake_command(name, asset), play_command(name, k, some.quality, own)),
         )
         for index, (name, asset) in enumerate(assets.items())
-        for some in dials
+        for some in dials[index]
+        for k in [fetches_used(asset, some.n_fetches, some.quality)]
     ]
     settings, sentence, recommended = conclude(rows, model)
     conditions = {
@@ -313,13 +314,12 @@ def _colours(pictures: list[np.ndarray]) -> list[np.ndarray]:
     return [picture[..., :3] for picture in pictures]
 
 
-def _all_dials(config: BenchConfig, assets: list[Asset]) -> list[Dials]:
-    """Return the dials to measure: exact pictures with every k, and the other
-    qualities with the assets' own k."""
-    own = {asset.manifest.n_fetches for asset in assets}
-    every = sorted(set(config.samples) | own, key=lambda k: k or 1e9)
-    others: tuple[Quality, ...] = ("high", "fast")
-    return [Dials(k) for k in every] + [Dials(k, quality) for quality in others for k in sorted(own)]
+def _all_dials(config: BenchConfig, assets: list[Asset]) -> list[list[Dials]]:
+    """Return the dials to measure of each asset: exact pictures with every k, and the other qualities with
+    the asset's own k."""
+    own = [asset.manifest.n_fetches for asset in assets]
+    every = [Dials(k) for k in sorted({*config.samples, *own}, key=lambda k: k or 1e9)]
+    return [[*every, Dials(k, "high"), Dials(k, "fast")] for k in own]
 
 
 def describe(asset: Asset) -> dict[str, Any]:

@@ -11,7 +11,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
 
 from player.asset.asset import Asset, write_asset
 from player.asset.bricks import pack_vertices
@@ -35,22 +34,6 @@ from vfr_bake.config import BakeConfig, BenchConfig, FieldConfig
 from vfr_bake.field.field import VfrField
 from vfr_bake.rendering.occupancy import OccupancyGrid
 from vfr_bake.training.model_file import Model, load_model, save_model
-
-
-@pytest.fixture(scope="module")
-def data(shells_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The asset's views as a NeRF-synthetic folder."""
-    folder = tmp_path_factory.mktemp("shells")
-    asset = Asset.open(shells_folder)
-    cameras = read_cameras(asset.path("cameras.json"))
-    for split, some in (("train", cameras[:3]), ("test", cameras[3:])):
-        named = [replace(camera, name=f"./{split}/photo_{i}") for i, camera in enumerate(some)]
-        (folder / split).mkdir()
-        for camera in named:
-            frame = render(asset, camera, n_fetches=0, march="numba")
-            Image.fromarray(frame.to_uint8()).convert("RGBA").save(folder / f"{camera.name}.png")
-        (folder / f"transforms_{split}.json").write_bytes(write_cameras(named))
-    return folder
 
 
 @pytest.fixture(scope="module")
@@ -352,7 +335,13 @@ def test_rounds_ask_everybody_in_turn() -> None:
         return ask
 
     times = measure_times(
-        [player("a"), player("b")], 2, [(8, 8)], [Dials(1), Dials(2)], 3, math.inf, lambda done, of: None
+        [player("a"), player("b")],
+        2,
+        [(8, 8)],
+        [[Dials(1), Dials(2)]] * 2,
+        3,
+        math.inf,
+        lambda done, of: None,
     )
     assert len(asked) == 3 * 2 * (1 + 2), "one frame of each visit is not counted"
     for visits in (asked[i : i + 6] for i in (0, 6, 12)):
@@ -376,7 +365,7 @@ def test_there_are_as_many_rounds_as_there_is_time_for(
     def progress(done: int, of: int) -> None:
         told.append((done, of))
 
-    times = measure_times([ask], 1, [(8, 8), (4, 4)], [Dials(1), Dials(2)], 8, until, progress)
+    times = measure_times([ask], 1, [(8, 8), (4, 4)], [[Dials(1), Dials(2)]], 8, until, progress)
     assert {each.frames for each in times.values()} == {n_rounds}
     assert told[0] == (1, 16) and told[-1] == (2 * n_rounds, 2 * n_rounds)
 
