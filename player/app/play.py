@@ -100,6 +100,10 @@ def play(
     if not chosen:
         raise ConfigError(f"--frames: expected at least one of the {len(cameras)} views, got none")
     _check_sizes(chosen, target, say)
+    if not settings.dask and settings.march != "numpy":
+        from player.proof import prove
+
+        prove(say)  # before the keys, which hold the march
     keys = [frame_key(asset, camera, settings) for camera in chosen]
     film = video_key(keys, settings.fps)
     if is_complete := settings.resume and target.is_complete(paths, film):
@@ -123,10 +127,6 @@ def play(
             f"--samples {settings.samples}: a ray has {asset.most_samples} samples at most, "
             "and every one is taken"
         )
-    if jobs and not settings.dask and settings.march != "numpy":
-        from player.proof import prove
-
-        prove(say)
     begin = time.perf_counter()
     done: list[Done] = []
     for frame in _rendered(asset, jobs, settings):

@@ -13,6 +13,7 @@ import time
 import weakref
 from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -303,6 +304,21 @@ def test_resume_does_not_mix_an_incomplete_copy_with_the_whole_asset(tmp_path: P
         assert play(first, cameras, again).n_kept == 2
         with pytest.raises(ConfigError, match="--resume: expected a frame of this asset"):
             play(second, cameras, again)
+
+
+@pytest.mark.extra
+@pytest.mark.parametrize("march", ["auto", "numba"])
+def test_resume_does_not_mix_the_frames_of_two_marches(
+    march: Literal["auto", "numba"], asset: Asset, tmp_path: Path
+) -> None:
+    """They differ by rounding. What counts is the march that is used, not how it was asked for."""
+    cameras = [camera.resized(24, 20) for camera in asset_cameras(asset)[:2]]
+    slow = PlaySettings(tmp_path / "o", march="numpy")
+    play(asset, cameras, slow)
+    with pytest.raises(ConfigError, match="--resume: expected a frame of this asset"):
+        play(asset, cameras, replace(slow, march=march, resume=True))
+    play(asset, cameras, replace(slow, march="numba", force=True))
+    assert play(asset, cameras, replace(slow, march=march, resume=True)).n_kept == 2
 
 
 def test_frames_are_known_by_the_asset_that_was_opened(broken_folder: Path, tmp_path: Path) -> None:
