@@ -20,8 +20,8 @@ from player.terminal import command_line, printable
 
 MANIFEST_KEYS = (
     "version", "generator", "resolution", "feature_resolution", "aabb", "world_from_model", "contracted",
-    "near", "step", "level_steps", "n_fetches", "density_range", "density_steps", "n_channels",
-    "feature_steps", "background", "colour_space", "view_size", "provenance",
+    "near", "step", "level_steps", "n_fetches", "agreement", "quality_fetches", "density_range",
+    "density_steps", "n_channels", "feature_steps", "background", "colour_space", "view_size", "provenance",
 )  # fmt: skip
 
 CONTENT = {
@@ -97,6 +97,7 @@ def page(folder: Path, m: Manifest, known: dict[str, Any]) -> list[str]:
             *([("levels", _level_sentence(known["levels"]))] if m.parts else []),
             ("step", _step(m, scale)),
             ("head", f"{known['head_parameters']:,} parameters, once a pixel"),
+            ("qualities", _quality_sentence(m)),
         ]),
     ]  # fmt: skip
     lines += _section("provenance", list(_flat(m.provenance)))
@@ -158,6 +159,18 @@ def _level_sentence(levels: dict[str, list[dict[str, int]]]) -> str:
     for grid, found in levels.items():
         n = [level["n_vertices"] for level in found]
         words.append(f"{len(found)} of {grid} ({', '.join(f'{count:,}' for count in n)} vertices)")
+    return "; ".join(words)
+
+
+def _quality_sentence(m: Manifest) -> str:
+    """Say what `high` and `fast` pictures of the training size leave out, compared with exact ones."""
+    words = []
+    for name, levels, fetches in zip(("high", "fast"), m.agreement, m.quality_fetches or (0, 0), strict=True):
+        left_out = [
+            *([f"pixels whose neighbours differ by at most {levels:g} of 255 levels"] if levels else []),
+            *([f"more than {fetches} fetches a ray"] if fetches else []),
+        ]
+        words.append(f"{name} leaves out {' and '.join(left_out) or 'nothing'}")
     return "; ".join(words)
 
 
