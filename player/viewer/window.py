@@ -31,8 +31,8 @@ if TYPE_CHECKING:
 
 PATH_FPS = 30
 STRIP_PIXELS = 50_000
-"""About the number of pixels of a strip. A full-size picture is rendered in strips, so that it can be given
-up between two of them."""
+"""Least number of pixels of a strip, about. A full-size picture is rendered in strips, so that it can be
+given up between two of them; each has as many pixels as a picture while the camera moves, if that is more."""
 MOST_PIXELS = 3840 * 2160
 """Most pixels of a full-size picture, whatever size a window says it has."""
 MOST_SIDE = 8192
@@ -351,7 +351,8 @@ class Window:
     def _in_strips(self, camera: Camera, version: int) -> np.ndarray | None:
         """Render the chosen layer [h, w, 3] uint8 in strips; returns None if something changed meanwhile."""
         layer = self._layer.value
-        rows = max(1, STRIP_PIXELS // camera.width // BLOCK) * BLOCK  # whole blocks: the lattice continues
+        pixels = max(STRIP_PIXELS, math.prod(self._pace.moving(camera.width, camera.height)))
+        rows = max(1, pixels // camera.width // BLOCK) * BLOCK  # whole blocks: the lattice continues
         frames = []
         for top in range(0, camera.height, rows):
             if self._closed or self._version != version:

@@ -224,6 +224,7 @@ def test_normals_are_rendered_as_other_layers_are(asset: Asset, monkeypatch: pyt
     monkeypatch.setattr(window_module, "STRIP_PIXELS", camera.width * BLOCK)
     with Renderer(asset, 2, "numpy") as renderer:
         window = window_of(renderer, camera, "normals", sent)
+        window._pace._pixels = 1.0
 
         def change(*arguments: Any) -> np.ndarray:
             names.append(threading.current_thread().name)
@@ -242,6 +243,21 @@ def test_normals_are_rendered_as_other_layers_are(asset: Asset, monkeypatch: pyt
             render()
             assert len(names) > n_before
     assert all(name.startswith("vfr-play") for name in names) and sent == ["screenshot.png"]
+
+
+@pytest.mark.parametrize(("moving", "n_strips"), [(1.0, 10), (2304.0, 4), (1e9, 1)])
+def test_a_strip_has_as_many_pixels_as_a_picture_while_moving(
+    moving: float, n_strips: int, asset: Asset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    camera, heights = read_cameras(asset.path("cameras.json"))[0].resized(96, 80), []
+    monkeypatch.setattr(window_module, "STRIP_PIXELS", camera.width * BLOCK)
+    with Renderer(asset, 1, "numpy") as renderer:
+        window = window_of(renderer, camera, "colour", [])
+        window._pace._pixels = moving
+        frame = window._frame
+        monkeypatch.setattr(window, "_frame", lambda *given: heights.append(given[0].height) or frame(*given))
+        assert window._in_strips(camera, 0) is not None
+    assert len(heights) == n_strips and sum(heights) == camera.height
 
 
 def test_a_closed_window_says_nothing_of_its_renderer(asset: Asset) -> None:
