@@ -84,7 +84,7 @@ void main() {
   for (int p = 0; p < 4; p++) {
     ivec2 at = first + ivec2(p & 1, p >> 1);
     vec3 direction = directionOf(vec2(at) + 0.5);
-    float scale = 128.0 * uintBitsToFloat(texelFetch(uOpacity, at, 0).x); // undoes the shares of pixel.glsl
+    float scale = uintBitsToFloat(texelFetch(uOpacity, at, 0).y); // undoes the shares of pixel.glsl
     READ_FEATURES
     WRITE_MONOMIALS
   }

@@ -1,6 +1,6 @@
 // Draws a layer of a pixel: marches its ray and writes what the layer shows. For the colour it writes what the head needs,
-// two features a word, as shares of the most that they can be at the pixel's opacity. FOUND_OUTPUTS, CLEAR_FEATURES and
-// WRITE_FOUND are replaced by code that program.js writes.
+// two features a word, as shares of the largest of the pixel. FOUND_OUTPUTS, CLEAR_FEATURES, LARGEST_FEATURES and WRITE_FOUND
+// are replaced by code that program.js writes.
 
 uniform vec3 uOrigin;
 uniform float uStart, uScale;
@@ -41,9 +41,10 @@ void main() {
   CLEAR_FEATURES
   if (hit) fetchFeatures(opacity);
 #ifndef COUNTING
-  float share = 1.0 / (128.0 * max(opacity, MIN_OPACITY));
+  vec4 largest = LARGEST_FEATURES;
+  float most = max(max(max(largest.x, largest.y), max(largest.z, largest.w)), 1e-20), share = 1.0 / most;
   WRITE_FOUND
-  foundOpacity = uvec4(floatBitsToUint(opacity), hit ? 1u : 0u, 0u, 0u);
+  foundOpacity = uvec4(floatBitsToUint(opacity), hit ? floatBitsToUint(most) : 0u, 0u, 0u);
 #endif
 #elif LAYER == 1
   float spread = (depth - uDepths.x) / max(uDepths.y - uDepths.x, 1e-12);

@@ -22,6 +22,7 @@ function featureTexts(nChannels) {
   return {
     FEATURES: `vec4 ${numbers.map((i) => `f${i}`).join(", ")};`,
     ADD_ROW: numbers.map((i) => `f${i} += share * featureAt(at + ivec3(${i}, 0, 0));`).join("\n"),
+    LARGEST_FEATURES: numbers.map((i) => `abs(f${i})`).reduce((a, b) => `max(${a}, ${b})`),
     CLEAR_FEATURES: numbers.map((i) => `f${i} = `).join("") + "vec4(0);",
     FOUND_OUTPUTS: `${outputs.join("")}layout(location = ${nOut}) out uvec4 foundOpacity;`,
     WRITE_FOUND: write.join("\n"),

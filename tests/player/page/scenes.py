@@ -114,7 +114,8 @@ def camera(name: str, c2w: np.ndarray, focal: float = 55.0, cx: float | None = N
 
 
 def cameras(asset: Asset) -> dict[str, Camera]:
-    """Return world cameras outside, inside, far from, and exactly along an axis of the model's box."""
+    """Return world cameras outside, inside, far from, exactly along an axis, and on the wall of the model's
+    box."""
     low, high = np.array(asset.manifest.aabb)
     middle, size = (low + high) / 2, float(np.max(high - low))
     along = np.eye(4)
@@ -130,6 +131,7 @@ def cameras(asset: Asset) -> dict[str, Camera]:
         ),
         "far": camera("far", far, away * 45.0),
         "axis": camera("axis", along, 60.0, WIDTH / 2 + 0.5),
+        "wall": camera("wall", look_at((middle[0], low[1], middle[2]), tuple(middle)), 50.0),
     }
     turn = asset.world_from_model / np.array([asset.scale] * 3 + [1.0])
     for name, some in found.items():

@@ -123,8 +123,9 @@ def test_thin_edges_before_a_transparent_background(chromium: Browser, tmp_path:
     player's."""
     asset = Asset.open(DEMO)
     demo = Scene(asset, RenderPage(chromium, asset, tmp_path / "demo.html"))
-    for view in (3, 12, 40):
-        demo.check(asset_cameras(asset)[view].resized(160, 160), None, "transparent")
+    views = [asset_cameras(asset)[view].resized(160, 160) for view in (3, 12, 40)]
+    for camera in (*views, demo.cameras["wall"].resized(96, 72), demo.cameras["axis"].resized(96, 72)):
+        demo.check(camera, None, "transparent")
     demo.player.close()
     demo.page.close()
 
