@@ -339,7 +339,7 @@ class BakeConfig:
     preset: Preset | None = None
     """Fidelity: for final pictures, nearly the model's own. Balanced: small and quick to play. Fast: fewer
     bytes and a smaller head. Phone: the fewest bytes, for pages on phones. Not given: balanced, or fidelity
-    if --max-loss-db is less than the loss that balanced aims at."""
+    if balanced loses more than --max-loss-db."""
     resolution: int | None = None
     """Cells per axis of the baked densities, at most half again the field's finest level."""
     feature_resolution: int | None = None
@@ -372,8 +372,8 @@ class BakeConfig:
     bytes allow, a tenth of the asset's."""
     max_loss_db: float | None = None
     """Take the fewest bytes that lose at most this against photographs; fail, and write nothing, if the
-    written files lose more all the same. Without --preset, a limit of less than 0.4 (unbounded scenes 0.5)
-    takes fidelity."""
+    written files lose more all the same. Without --preset, a bake whose refined values lose more begins
+    again with fidelity."""
     max_mb: float | None = None
     """Store the values less precisely than the preset does, on coarser grids if need be, until the asset fits
     into this many megabytes, the report not counted; fail, and write nothing, if it takes more all the
@@ -431,12 +431,8 @@ class BakeConfig:
         (3, 12)
         >>> BakeConfig().choice(unbounded=True).refine_steps
         2100
-        >>> BakeConfig().choice().preset, BakeConfig(max_loss_db=0.1).choice().preset
-        ('balanced', 'fidelity')
         """
         preset = _choice(self.preset or "balanced", unbounded)
-        if self.preset is None and self.max_loss_db is not None and self.max_loss_db < preset.target_loss_db:
-            preset = _choice("fidelity", unbounded)
         given = {name: getattr(self, name, None) for name in BakeChoice.__dataclass_fields__}
         given["n_fetches"] = None if self.k == "auto" else self.k
         choice = replace(preset, **{name: value for name, value in given.items() if value is not None})

@@ -4,16 +4,13 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 from player.asset.asset import Asset
-from player.errors import FormatError, TrainingError
+from player.errors import FormatError
 from vfr_bake.baking.limits import page_memory
-from vfr_bake.cli import bake_main
-from vfr_bake.config import BakeConfig, FieldConfig
 from vfr_bake.presets import PRESETS, Preset
 
 DOCUMENT = Path(__file__).resolve().parents[2] / "docs" / "bake.md"
@@ -49,29 +46,6 @@ def test_a_row_says_what_the_preset_decides(name: str) -> None:
     assert (layers, width) == (3 + preset.head_layers, preset.head_width)
     harmonics = re.search(r"(\d+) spherical harmonics", head)
     assert (int(harmonics[1]) if harmonics else 16) == preset.head_bands**2
-
-
-def test_a_limit_below_what_balanced_aims_at_takes_fidelity_and_says_so(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    model = SimpleNamespace(field=SimpleNamespace(config=FieldConfig()))
-    monkeypatch.setattr("vfr_bake.training.model_file.load_model", lambda *_: model)
-
-    def planned(model: object, config: BakeConfig) -> None:
-        raise TrainingError(f"planned with {config.choice().preset}")
-
-    monkeypatch.setattr("vfr_bake.baking.plan.make_plan", planned)
-    for limit, given, preset, says in (
-        ("0.3", [], "fidelity", True),
-        ("0.5", [], "balanced", False),
-        ("0.3", ["--preset", "balanced"], "balanced", False),
-        ("0.01", ["--preset", "fidelity"], "fidelity", False),
-    ):
-        options = ["model.pt", str(tmp_path / "asset"), "--max-loss-db", limit, *given]
-        assert bake_main(options) == 1
-        error = capsys.readouterr().err
-        assert f"planned with {preset}" in error
-        assert ("--max-loss-db 0.3 is less than balanced aims at: preset fidelity" in error) == says
 
 
 def test_a_page_of_more_memory_than_the_preset_aims_at_is_named(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -28,7 +28,7 @@ def test_a_bake_asks_before_it_begins(
     child_runs(monkeypatch, DIES)
     model = SimpleNamespace(field=SimpleNamespace(config=FieldConfig()))
     monkeypatch.setattr(model_file, "load_model", lambda *_: model)
-    monkeypatch.setattr(bake, "check_bakeable", lambda *_: None)
+    monkeypatch.setattr(plan, "check_bakeable", lambda *_: None)
     monkeypatch.setattr(plan, "make_plan", lambda *_: made)
     monkeypatch.setattr(plan, "expected_seconds", lambda *_: 1.0)
     monkeypatch.setattr(bake, "bake", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))

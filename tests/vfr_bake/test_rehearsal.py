@@ -12,7 +12,8 @@ from typing import Any
 import pytest
 
 from vfr_bake import demo, rehearsal
-from vfr_bake.baking.bake import BakeResult, bake
+from vfr_bake.baking.bake import bake
+from vfr_bake.baking.report import BakeResult
 
 
 def test_a_rehearsal_stores_and_refines_as_a_bake_does_and_leaves_nothing(

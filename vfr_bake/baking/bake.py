@@ -12,7 +12,7 @@ import time
 from bisect import bisect_left
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -24,12 +24,11 @@ from exporters.formats.ply import small_ply_bytes
 from exporters.head.onnx_head import HeadWeights, Range, head_onnx
 from exporters.shapes.mesh import TriangleMesh
 from exporters.surface.asset_surface import Removed
-from player.asset.arranging import OTHERS
 from player.asset.asset import Asset, GridArrays, write_asset
 from player.asset.manifest import Manifest
 from player.asset.target import check_asset_target
 from player.cameras.transforms import write_cameras
-from player.errors import ConfigError, TrainingError
+from player.errors import TrainingError
 from player.files.memory import give_back
 from player.head.head import Head
 from player.progress import Report
@@ -59,6 +58,7 @@ from vfr_bake.baking.head import fold_head, runner, small_head
 from vfr_bake.baking.held_out import BETWEEN, HeldOut, Stage, views_between
 from vfr_bake.baking.limits import (
     MANIFEST_BYTES,
+    LossMissedError,
     cells_that_fit,
     check_budget,
     file_sizes,
@@ -68,16 +68,21 @@ from vfr_bake.baking.limits import (
     unwritten_asset,
 )
 from vfr_bake.baking.mesh import bake_mesh, mesh_bytes
-from vfr_bake.baking.plan import make_plan, photographed, refinement_seconds
+from vfr_bake.baking.plan import (
+    check_bakeable,
+    make_plan,
+    other_bytes,
+    photographed,
+    refinement_seconds,
+)
 from vfr_bake.baking.qualities import Qualities, compared_views, fitting_qualities
 from vfr_bake.baking.rate.importance import importance
 from vfr_bake.baking.rate.price import Prices, PriceSearch
 from vfr_bake.baking.refinement import Stored, Tuning
-from vfr_bake.baking.report import BakeReport, side_by_side
+from vfr_bake.baking.report import BakeReport, BakeResult, side_by_side
 from vfr_bake.config import BakeConfig
 from vfr_bake.presets import BakeChoice
 from vfr_bake.rendering.occupancy import OccupancyGrid
-from vfr_bake.training.length.witness_loss import Loss
 from vfr_bake.training.model_file import Model
 
 N_PROJECTED = 100_000
@@ -92,42 +97,28 @@ LAST_PART = "writing and checking"
 """The part of a bake in which the report is made."""
 
 
-@dataclass(frozen=True)
-class BakeResult:
-    """Size, time and loss of a finished bake."""
-
-    n_vertices: int
-    n_bytes: int
-    """Bytes of all files but the report."""
-    seconds: float
-    loss: Loss
-    """Loss against photographs, compared with the trained model."""
-    figures: dict[str, Any]
-    missed: list[str]
-    """The targets that were missed, in words."""
-
-
 def bake(model: Model, folder: Path, config: BakeConfig, report: Report, force: bool = False) -> BakeResult:
     """Bake `model` into the asset `folder`.
 
     Raises OutputError, ConfigError, or TrainingError; nothing is written then. A TrainingError means that
     nothing is visible, that the baked grid does not show what the model shows, or that the result misses
-    `max_loss_db`, `max_mb` or `target_ms`.
+    `max_loss_db`, `max_mb` or `target_ms`. If no preset is given, and balanced misses `max_loss_db`, it
+    begins again with fidelity.
     """
     check_asset_target(folder, force)
     check_bakeable(model, config)
     work = _Bake(model, config, report)
-    return work.run(folder, force)
-
-
-def check_bakeable(model: Model, config: BakeConfig) -> None:
-    """Raise ConfigError if the model's field cannot be stored in an asset."""
-    field = model.field.config
-    for name, needed in (("compositing", "features"), ("activation", "gelu")):
-        if getattr(field, name) != needed:
-            raise ConfigError(f"model: {name}: expected {needed} to bake, got {getattr(field, name)}")
-    if field.unbounded and config.no_cull:
-        raise ConfigError("--no-cull: expected the model of an object, got that of an unbounded scene")
+    try:
+        return work.run(folder, force)
+    except LossMissedError as missed:
+        if config.preset is not None:
+            raise
+        spent, lost = sum(work.seconds.values()), str(missed)
+    del work  # free its memory
+    finer = _Bake(model, replace(config, preset="fidelity"), report)
+    finer.left_out["preset"] = f"balanced: {lost}"
+    result = finer.run(folder, force)
+    return replace(result, seconds=result.seconds + spent)
 
 
 class _Bake:
@@ -162,13 +153,16 @@ class _Bake:
         tuning = Tuning(self.config, self.choice, self.held_out, self._report, left, most_kept)
         with self._part("refinement"):
             stored = tuning.run(stored, layout, teacher, again)
+        limit, loss = self.config.max_loss_db, tuning.kept.loss
+        if self.config.preset is None and limit is not None and loss.db > limit:
+            raise LossMissedError(f"its refined values lose {loss}, more than {limit:g} dB")
         self.n_fetches, self.lookups = tuning.n_fetches, tuning.lookups
         self.left_out |= tuning.left_out
         head = head_onnx(stored.head, tuning.ranges)
         played = runner(stored.head, tuning.ranges)
         most_db = self.choice.culled_loss_db
-        if self.config.max_loss_db is not None:
-            left_db = self.config.max_loss_db - tuning.kept.loss.db
+        if limit is not None:
+            left_db = limit - loss.db
             most_db = min(most_db, max(DETAIL_SHARE * left_db, 0.0))
         detail = Detail(self.held_out, played, self.n_fetches, most_db, partial(self._report, "detail"))
         with self._part("detail"):
@@ -253,7 +247,8 @@ class _Bake:
         config, choice, plan = self.config, self.choice, self.plan
         yield plan.most_cells, f"{config.memory:.3g} GB of memory"
         if config.max_mb is not None:
-            yield cells_that_fit(config.max_mb, self._other_bytes(config.max_mb)), f"{config.max_mb:g} MB"
+            others = other_bytes(self.model, choice, config.max_mb)
+            yield cells_that_fit(config.max_mb, others), f"{config.max_mb:g} MB"
         if np.isfinite(plan.page_cells):
             yield int(plan.page_cells), f"a page that takes {choice.page_mb:g} MB of graphics memory"
 
@@ -379,13 +374,6 @@ class _Bake:
         with TemporaryDirectory() as folder:
             asset = unwritten_asset(Path(folder), manifest, arrays, {"head.onnx": head})
             return fitting_qualities(asset, views, error)
-
-    def _other_bytes(self, max_mb: float) -> int:
-        """Estimate the bytes of an asset of `max_mb` megabytes other than stored values and manifest."""
-        mesh = mesh_bytes(round(max_mb * 1e6 * OTHERS / (OTHERS + 1)), None)
-        n_weights = sum(array.numel() for array in self.model.field.head.parameters())
-        head = 0 if self.choice.head_width else n_weights * self.choice.head_bits // 8
-        return mesh + len(write_cameras(self.model.cameras)) + head
 
     def _is_in_time(self, stored: Stored, layout: Layout) -> bool:
         """Narrow the head and take fewer feature lookups, as far as it takes to render a frame in the time

@@ -90,9 +90,14 @@ def page_memory(asset: Asset, preset: Preset) -> tuple[int | None, list[str]]:
     ]
 
 
+class LossMissedError(TrainingError):
+    """A bake loses more than is allowed."""
+
+
 def check_budget(config: BakeConfig, loss: Loss, megabytes: float, ms: float | None) -> None:
-    """Raise TrainingError if the written files miss a limit; the message says what they reach. `ms` is the
-    frame time, or None if it was not limited. A loss that is only expected, not measured, misses none."""
+    """Raise TrainingError, or LossMissedError, if the written files miss a limit; the message says what they
+    reach. `ms` is the frame time, or None if it was not limited. A loss that is only expected, not measured,
+    misses none."""
     limits = (
         ("loss", config.max_loss_db, None if loss.spread is None else loss.db, "dB"),
         ("size", config.max_mb, megabytes, "MB"),
@@ -100,7 +105,8 @@ def check_budget(config: BakeConfig, loss: Loss, megabytes: float, ms: float | N
     )
     for name, limit, got, unit in limits:
         if limit is not None and got is not None and got > limit:
-            raise TrainingError(
+            error = LossMissedError if name == "loss" else TrainingError
+            raise error(
                 f"bake: {name}: expected at most {limit:g} {unit}, got {got:.2f} {unit} ({loss.db:.2f} dB in "
                 f"{megabytes:.1f} MB): nothing was written: allow more, or change the preset"
             )

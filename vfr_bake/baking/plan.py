@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from exporters.head.onnx_head import head_onnx
+from player.asset.arranging import OTHERS
 from player.cameras.transforms import write_cameras
 from player.errors import ConfigError, TrainingError
 from player.kept_code import is_kept
@@ -29,6 +30,7 @@ from vfr_bake.baking.distillation import render_teacher
 from vfr_bake.baking.head import fold_head, small_head
 from vfr_bake.baking.held_out import BETWEEN
 from vfr_bake.baking.limits import WIDTHS, cells_of_page
+from vfr_bake.baking.mesh import mesh_bytes
 from vfr_bake.baking.refinement import BATCH, HEAD_BATCH, head_steps, refined_steps, steps_at_k
 from vfr_bake.config import BakeConfig
 from vfr_bake.kernels import SOURCES
@@ -164,6 +166,16 @@ class Plan:
         return int(PROGRAM_BYTES + max(self.marks, min(held, self.room)))
 
 
+def check_bakeable(model: Model, config: BakeConfig) -> None:
+    """Raise ConfigError if the model's field cannot be stored in an asset."""
+    field = model.field.config
+    for name, needed in (("compositing", "features"), ("activation", "gelu")):
+        if getattr(field, name) != needed:
+            raise ConfigError(f"model: {name}: expected {needed} to bake, got {getattr(field, name)}")
+    if field.unbounded and config.no_cull:
+        raise ConfigError("--no-cull: expected the model of an object, got that of an unbounded scene")
+
+
 def make_plan(model: Model, config: BakeConfig) -> Plan:
     """Plan a bake that takes at most `config.memory` gigabytes.
 
@@ -214,6 +226,14 @@ def _fixed_bytes(model: Model, config: BakeConfig) -> int:
         head = small_head(head, width, choice.head_layers, 1, np.ones(n_channels))
     any_ranges = [(0.0, 1.0)] * (2 + len(head.directional)) if choice.head_bits == 8 else None
     return len(write_cameras(model.cameras)) + len(head_onnx(head, any_ranges)) + FEWEST_MANIFEST_BYTES
+
+
+def other_bytes(model: Model, choice: BakeChoice, max_mb: float) -> int:
+    """Estimate the bytes of an asset of `max_mb` megabytes other than stored values and manifest."""
+    mesh = mesh_bytes(round(max_mb * 1e6 * OTHERS / (OTHERS + 1)), None)
+    n_weights = sum(array.numel() for array in model.field.head.parameters())
+    head = 0 if choice.head_width else n_weights * choice.head_bits // 8
+    return mesh + len(write_cameras(model.cameras)) + head
 
 
 def _resolutions(model: Model, config: BakeConfig, most: float) -> Resolutions:

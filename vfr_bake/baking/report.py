@@ -20,6 +20,7 @@ from player.files.images import png_bytes
 from player.render import Renderer
 from vfr_bake.baking.held_out import views_between
 from vfr_bake.rendering.render import render_image
+from vfr_bake.training.length.witness_loss import Loss
 from vfr_bake.training.model_file import Model
 from vfr_bake.training.scores.metrics import BRIGHTEST_ERROR, comparison
 
@@ -54,6 +55,21 @@ class Pictures(NamedTuple):
         data = base64.b64encode(png_bytes(comparison(self.wanted, self.played))).decode()
         name = escape(self.name)
         return f'<p>{name}<br><img alt="{name}" src="data:image/png;base64,{data}"></p>'
+
+
+@dataclass(frozen=True)
+class BakeResult:
+    """Size, time and loss of a finished bake."""
+
+    n_vertices: int
+    n_bytes: int
+    """Bytes of all files but the report."""
+    seconds: float
+    loss: Loss
+    """Loss against photographs, compared with the trained model."""
+    figures: dict[str, Any]
+    missed: list[str]
+    """The targets that were missed, in words."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -27,15 +27,12 @@ def bake_command(options: Any) -> int:
     if options.convert:
         return _convert(options)
     from player.proof import prove
-    from vfr_bake.baking.bake import bake, check_bakeable
-    from vfr_bake.baking.plan import COMPILE_SECONDS, expected_seconds, is_compiled, make_plan
+    from vfr_bake.baking.bake import bake
+    from vfr_bake.baking.plan import COMPILE_SECONDS, check_bakeable, expected_seconds, is_compiled, make_plan
     from vfr_bake.training.model_file import load_model
 
     model = load_model(options.model, options.config.memory)
     check_bakeable(model, options.config)
-    preset = options.config.choice(model.field.config.unbounded).preset
-    if options.config.preset is None and preset != BakeConfig().choice().preset:
-        _say(f"--max-loss-db {options.config.max_loss_db:g} is less than balanced aims at: preset {preset}")
     plan = make_plan(model, options.config)
     minutes = expected_seconds(model, options.config, plan) / 60
     fine, coarse = plan.resolutions
@@ -64,6 +61,8 @@ def bake_command(options: Any) -> int:
             "the model has no witnesses (docs/train.md), so that the loss is estimated from its "
             "own pictures: train again to have it measured against photographs"
         )
+    if "preset" in result.figures["left_out"]:
+        _say(f"baked with preset fidelity; {result.figures['left_out']['preset']}")
     for missed in result.missed:
         _say(f"warning: {missed} (see report.html)")
     return 0

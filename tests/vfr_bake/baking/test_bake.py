@@ -27,7 +27,7 @@ from tests.exporters.meshes import read_ply
 from tests.numerics.fog import fog
 from tests.vertex_grids import rows_of
 from tests.vfr_bake.data.solids import AABB, signed_distance
-from vfr_bake.baking.bake import BakeResult, _Bake, bake
+from vfr_bake.baking.bake import _Bake, bake
 from vfr_bake.baking.cells import corners_of, pixel_footprints
 from vfr_bake.baking.distillation import (
     Fetches,
@@ -53,6 +53,7 @@ from vfr_bake.baking.refinement import (
     refine,
     train_head,
 )
+from vfr_bake.baking.report import BakeResult
 from vfr_bake.config import BakeConfig, FieldConfig
 from vfr_bake.field.networks import HeadNetwork
 from vfr_bake.kernels.latent_rows import PARTS

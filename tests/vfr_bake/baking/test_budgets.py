@@ -24,7 +24,7 @@ from vfr_bake.baking.bake import _Bake, bake
 from vfr_bake.baking.cells import FLOORS, Resolutions
 from vfr_bake.baking.grids import Layout
 from vfr_bake.baking.head import fold_head, small_head
-from vfr_bake.baking.limits import RESERVE, file_sizes, keep_to_time
+from vfr_bake.baking.limits import RESERVE, LossMissedError, file_sizes, keep_to_time
 from vfr_bake.baking.mesh import bake_mesh
 from vfr_bake.baking.plan import (
     AT_K_COST,
@@ -53,6 +53,7 @@ from vfr_bake.baking.plan import (
     make_plan,
 )
 from vfr_bake.baking.refinement import BATCH, HEAD_BATCH, HEAD_SHARE, Stored, Tuning
+from vfr_bake.baking.report import BakeResult
 from vfr_bake.config import LEAST_MEMORY, BakeConfig
 from vfr_bake.kernels import SOURCES
 from vfr_bake.presets import PRESETS, Preset
@@ -175,7 +176,7 @@ def test_detail_takes_no_more_than_half_of_the_loss_that_is_left(
     model: Model, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Refinement has lost 0.3 dB, and the preset gives up 0.06 dB of detail if that is not limited."""
-    work = _Bake(model, BakeConfig(**SMALL), silent)
+    work = _Bake(model, BakeConfig(preset="balanced", **SMALL), silent)
     layout, _ = work._cells()
     stored = work._store(layout, 20_000)
     allowed: list[float] = []
@@ -197,6 +198,34 @@ def test_detail_takes_no_more_than_half_of_the_loss_that_is_left(
         with pytest.raises(TrainingError, match="as far as this"):
             work.run(tmp_path / "asset", False)
     assert allowed == pytest.approx([0.06, 0.06, 0.02, 0.0])
+    work.config = replace(work.config, preset=None)  # 0.2 dB is less than balanced has lost
+    with pytest.raises(LossMissedError, match=r"lose 0\.30 dB \(give or take 0\.00\), more than 0\.2 dB"):
+        work.run(tmp_path / "asset", False)
+
+
+@pytest.mark.parametrize("preset", [None, "balanced"])
+def test_a_bake_begins_again_with_fidelity_where_balanced_loses_too_much(
+    preset: Preset | None, model: Model, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without a preset, a limit that balanced misses takes fidelity; the time of both bakes counts."""
+    tried: list[str] = []
+
+    def run(work: _Bake, folder: Path, force: bool) -> BakeResult:
+        tried.append(work.choice.preset)
+        work.seconds["refinement"] = 30.0
+        if work.choice.preset == "balanced":
+            raise LossMissedError("it loses 0.3 dB")
+        return BakeResult(0, 0, 30.0, Loss(0.1, 0.0), {"left_out": work.left_out}, [])
+
+    monkeypatch.setattr(_Bake, "run", run)
+    config = BakeConfig(preset=preset, max_loss_db=0.2, **SMALL)
+    if preset is not None:
+        with pytest.raises(LossMissedError):
+            bake(model, tmp_path / "asset", config, silent)
+        return
+    result = bake(model, tmp_path / "asset", config, silent)
+    assert tried == ["balanced", "fidelity"]
+    assert result.figures["left_out"]["preset"] == "balanced: it loses 0.3 dB" and result.seconds > 60
 
 
 def test_a_size_that_cannot_be_met_is_refused_when_the_bake_is_planned(

@@ -15,8 +15,9 @@ from player.progress import silent
 from player.render import render
 from tests.player.march.pyramid_scene import random_scene
 from vfr_bake.baking import held_out
-from vfr_bake.baking.bake import BakeResult, bake
+from vfr_bake.baking.bake import bake
 from vfr_bake.baking.held_out import HeldOut, Shown, expected_loss
+from vfr_bake.baking.report import BakeResult
 from vfr_bake.config import BakeConfig
 from vfr_bake.rendering.render import render_image
 from vfr_bake.training.length.witness_loss import PATCH_WEIGHT, Loss
