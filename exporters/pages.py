@@ -66,7 +66,7 @@ def files_in_page(page: bytes) -> dict[str, bytes]:
     Raises ParityError: the text of a file cannot be decoded into bytes.
     """
     found = {}
-    for name, text in re.findall(rb'<script type="text/plain" data-file="([^"]*)">([^<]*)</script>', page):
+    for name, text in re.findall(rb'<script[^>]* data-file="([^"]*)"[^>]*>([^<]*)</script>', page):
         try:
             found[name.decode()] = text if name.decode() == MANIFEST else bytes_of_text(text)
         except ValueError as error:

@@ -18,8 +18,8 @@ Files of `player/page/web`:
 
 The compressed script is the element with the id `viewer`. `boot.js` unpacks it to an element with the id
 `script`, whose text the worker runs as well. In the one file, each file of the data is an element
-`<script type="text/plain" data-file="NAME">`, the manifest as it is and the others as text. The scripts come
-before the data, so that they can tell where the data are cut short.
+`<script type="text/plain" data-file="NAME">`: the manifest as it is, with its SHA-256 in `data-sha256`, and
+the others as text. The scripts come before the data, so that they can tell where the data are cut short.
 """
 
 from __future__ import annotations
@@ -217,8 +217,11 @@ def data_elements(files: Mapping[str, bytes]) -> bytes:
         name: data.replace(b"<", b"\\u003c") if name == MANIFEST else text_of_bytes(data)
         for name, data in files.items()
     }
+    digest = hashlib.sha256(texts[MANIFEST]).hexdigest()
+    attributes = {MANIFEST: f' data-sha256="{digest}"'.encode()}
     return b"".join(
-        b'<script type="text/plain" data-file="%s">%s</script>\n' % (name.encode(), text)
+        b'<script type="text/plain" data-file="%s"%s>%s</script>\n'
+        % (name.encode(), attributes.get(name, b""), text)
         for name, text in texts.items()
     )
 

@@ -23,7 +23,7 @@
 // If the browser or the device cannot decode a scene, the Error that loadScene throws has `isWhole`: true, which says that
 // the data are not to blame, or is one that `refusesMemory` knows. If no scene is found beside the page, it has `isAlone`: true.
 
-import { SceneReader, checkedFile } from "./scene_reader.js";
+import { SceneReader, checkedFile, checkSum } from "./scene_reader.js";
 
 const MANIFEST = "manifest.json";
 const GRIDS = ["densities", "features"];
@@ -119,11 +119,15 @@ async function fetched(name, entry, onBytes = () => {}, signal) {
 
 async function manifestOf(isFile) {
   const text = isFile ? textInPage(MANIFEST) : new TextDecoder().decode(await fetched(MANIFEST));
+  let manifest;
   try {
-    return JSON.parse(text);
+    manifest = JSON.parse(text);
   } catch {
     throw new Error(`${MANIFEST}: expected JSON: the page was cut short or changed`);
   }
+  const { sha256 } = document.querySelector("[data-sha256]")?.dataset ?? {};
+  if (isFile) await checkSum(MANIFEST, new TextEncoder().encode(text), sha256);
+  return manifest;
 }
 
 const TYPES = { float32: Float32Array, int8: Int8Array, int32: Int32Array };

@@ -30,7 +30,6 @@ from player.page.page import WebPage, page_of_many_files, page_of_one_file, page
 from player.page.scene_files import scene_files
 from player.page.text_bytes import ALPHABET, bytes_of_text, text_of_bytes
 from tests.player.page import scenes
-from tests.player.page.viewer_page import wait_for
 
 SECONDS = 120
 MOST_VIEWER = 60_000
@@ -336,20 +335,6 @@ def test_a_site_that_is_exported_again_shows_the_new_scene(
         assert len({url for url in found.asked if url.startswith(address + "poster.jpg")}) == 2
 
 
-@pytest.mark.parametrize("make", [page_of_one_file, page_of_many_files])
-def test_a_page_without_javascript_says_what_to_do(
-    chromium: Browser, asset: Asset, tmp_path: Path, make: Callable[[Asset], WebPage]
-) -> None:
-    for name, data in make(asset).files.items():
-        (tmp_path / name).write_bytes(data)
-    with chromium.new_context(java_script_enabled=False) as context:
-        found = context.new_page()
-        found.set_default_timeout(SECONDS * 1000)
-        found.goto((tmp_path / "index.html").as_uri())
-        wait_for(found, lambda: "script cannot run here. Open " in found.inner_text("#status"))
-        assert "with JavaScript switched on" in found.inner_text("#status")
-
-
 @pytest.mark.parametrize("where", ["on a disk", "without its slash", "where another page answers"])
 def test_a_folder_whose_scene_is_not_found_says_what_to_do(
     chromium: Browser, asset: Asset, tmp_path: Path, where: str
@@ -430,11 +415,12 @@ def test_a_site_in_a_browser_that_cannot_decode_it_names_others(chromium: Browse
 
 
 def test_a_scene_that_takes_too_much_memory_to_decode_asks_for_another_device(
-    chromium: Browser, asset: Asset, tmp_path: Path
+    chromium: Browser, asset: Asset
 ) -> None:
-    path = tmp_path / "scene.html"
-    path.write_bytes(re.sub(rb'"n_vertices":\d+', b'"n_vertices":1073741824', page(asset)))
-    with opened(chromium, path.as_uri()) as found:
+    answers = site(asset)
+    manifest, kind = answers[SITE + "manifest.json"]
+    manifest = re.sub(rb'"n_vertices":\d+', b'"n_vertices":1073741824', manifest)
+    with opened(chromium, SITE, answers | {SITE + "manifest.json": (manifest, kind)}) as found:
         assert "MB of memory: expected at most 3200 MB" in check_advises_another_device(found)
 
 
@@ -493,6 +479,14 @@ def test_a_page_that_was_changed_says_so(
         assert "changed on its way" in found.page.inner_text("body")
         told = found.page.evaluate("() => vfr.render({}).then(() => null, (error) => error.message)")
         assert "changed on its way" in told
+
+
+def test_a_page_whose_manifest_was_changed_says_so(chromium: Browser, asset: Asset, tmp_path: Path) -> None:
+    path = tmp_path / "changed.html"
+    path.write_bytes(page(asset).replace(b'"n_channels":4', b'"n_channels":5', 1))
+    with opened(chromium, path.as_uri()) as found:
+        told = found.page.evaluate("() => vfr.ready.then(() => null, (error) => error.message)")
+        assert told == "manifest.json: sha256: expected another one: it was changed on its way"
 
 
 def test_an_installed_package_has_the_files_of_the_page() -> None:

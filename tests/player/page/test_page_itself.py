@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -24,8 +24,8 @@ from player.errors import ConfigError, FormatError
 from player.files.images import to_8_bit
 from player.page.gpu_memory import decoding_bytes, feature_bytes
 from player.page.notebook import inline
+from player.page.page import WebPage, page_of_many_files, page_of_one_file
 from player.page.page import page as page_of
-from player.page.page import page_of_many_files, page_of_one_file
 from player.page.rest import rest_camera
 from player.render import Renderer
 from player.viewer.server import ServeSettings, serve
@@ -192,6 +192,20 @@ def test_a_notebook_shows_it_below_a_cell(chromium: Browser, asset: Asset, tmp_p
     assert not card.is_visible()
     context.close()
     assert not said
+
+
+@pytest.mark.parametrize("make", [page_of_one_file, page_of_many_files])
+def test_a_page_without_javascript_says_what_to_do(
+    chromium: Browser, asset: Asset, tmp_path: Path, make: Callable[[Asset], WebPage]
+) -> None:
+    for name, data in make(asset).files.items():
+        (tmp_path / name).write_bytes(data)
+    with chromium.new_context(java_script_enabled=False) as context:
+        found = context.new_page()
+        found.set_default_timeout(SECONDS * 1000)
+        found.goto((tmp_path / "index.html").as_uri())
+        wait_for(found, lambda: "script cannot run here. Open " in found.inner_text("#status"))
+        assert "with JavaScript switched on" in found.inner_text("#status")
 
 
 @pytest.mark.parametrize(("n_channels", "most"), [(4, 2**24), (32, 2**24), (33, 2**23), (40, 2**23)])
