@@ -1,10 +1,13 @@
 """Arrange the sections of a new asset in parts, of which the first is a whole, coarser picture.
 
 Sections are sorted by what they show: first all that the coarsest picture needs, then what makes it sharper,
-with densities before features and the first channels before the others. They are cut into parts so that the
-first picture, head and cameras included, needs only a few hundredths of the asset's bytes and appears at
-once. Further parts end at about a tenth, a quarter and half of the bytes (`SHARES`). If head and cameras take
-so many of them that nothing can be shown within one of these shares, the first part ends at a later one.
+with densities before features and the first channels before the others. Parts end at a few hundredths, about
+a tenth, a quarter and half of the bytes, head and cameras included (`SHARES`). Each takes the sections that
+still fit, in this order, and leaves the others to later parts; so a single large section does not keep small
+ones waiting, and every part ends near its share. If head and cameras take so many bytes that nothing can be
+shown within one of these shares, the first part ends at a later one.
+
+docs/notes/2026-11-30-order-of-parts.md compares orders.
 """
 
 from __future__ import annotations
@@ -12,6 +15,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise, repeat
+from math import log2
 from typing import NamedTuple
 
 import numpy as np
@@ -29,6 +33,8 @@ SHARES = (0.025, 0.1, 0.25, 0.5, 1.0)
 OTHERS = 9
 """Bytes of the other files for each byte of a mesh that a bake makes: the mesh takes at most a tenth of the
 asset's bytes."""
+MOST_SINGLE = 64
+"""The most channels that are coded one by one, because parts have at most 1024 sections."""
 THREADS = 2
 """Number of sections that are encoded at a time: each takes memory of its own."""
 
@@ -94,7 +100,7 @@ def _sections(
         counts = {"n_bricks": len(bricks), "n_vertices": vertices.n}
         yield WrittenSection(Section(grid, level, len(data), "structure", **counts), data)
         rows = level_rows(vertices)
-        groups = list(pairwise(channel_groups(stored.n_channels)))
+        groups = list(pairwise(channel_groups(stored.n_channels, level)))
         some = [symbols[level][:, first:end] for first, end in groups]
         coded = threads.map(encode_level, some, repeat(rows))
         for (first, end), data in zip(groups, coded, strict=True):
@@ -102,26 +108,30 @@ def _sections(
             yield WrittenSection(Section(grid, level, len(data), "symbols", **channels), data)
 
 
-def channel_groups(n_channels: int) -> list[int]:
-    """Return where each group of channels begins, and last the number of channels. Each group doubles the
-    number of channels up to its end.
+def channel_groups(n_channels: int, level: int) -> list[int]:
+    """Return where each group of channels of a level begins, and last the number of channels.
 
-    >>> channel_groups(1), channel_groups(8), channel_groups(10)
-    ([0, 1], [0, 2, 4, 8], [0, 2, 4, 8, 10])
+    The channels of levels 1 and 2 are small enough to fill a part up, and take fewer bytes one by one. On
+    other levels, each group doubles the number of channels, because each takes some bytes of its own.
+
+    >>> channel_groups(1, 0), channel_groups(6, 0), channel_groups(6, 1)
+    ([0, 1], [0, 1, 2, 4, 6], [0, 1, 2, 3, 4, 5, 6])
     """
-    return [0, *(1 << n for n in range(1, n_channels.bit_length()) if 1 << n < n_channels), n_channels]
+    if level in (1, 2) and n_channels <= MOST_SINGLE:
+        return list(range(n_channels + 1))
+    return [0, *(1 << n for n in range(n_channels.bit_length()) if 1 << n < n_channels), n_channels]
 
 
 def _turn(written: WrittenSection) -> tuple[float, ...]:
     """Return the key by which the sections of an asset are sorted.
 
     A level comes after the coarser one. Later channels come together with the first channels of finer levels:
-    each group of channels from the third on is delayed by half a level.
+    twice as many channels are delayed by one level. No section comes before one that it needs.
     """
     section = written.section
-    late = max((section.end_channel - 1).bit_length() - 2, 0) if section.kind == "symbols" else 0
+    late = log2(section.end_channel) if section.kind == "symbols" else 0
     return (
-        late / 2 - section.level,
+        late - section.level,
         section.grid != "densities",
         section.kind != "structure",
         -section.level,
@@ -129,18 +139,52 @@ def _turn(written: WrittenSection) -> tuple[float, ...]:
     )
 
 
+def _place_in_part(written: WrittenSection) -> tuple[int, ...]:
+    """Return the key by which the sections of a part are sorted: level by level, because a reader prepares
+    the rows of a level for all of its sections that follow one another."""
+    section = written.section
+    return -section.level, section.grid != "densities", section.kind != "structure", section.first_channel
+
+
+def _needs(section: Section, other: Section) -> bool:
+    """Return whether a section cannot be decoded before another one that comes before it by `_turn`."""
+    if section.grid != other.grid or other.level < section.level:
+        return False
+    if other.kind == "structure":
+        return True
+    return section.kind == "symbols" and other.first_channel < section.end_channel
+
+
+def _that_fit(
+    sections: Sequence[WrittenSection], most: float
+) -> tuple[list[WrittenSection], list[WrittenSection]]:
+    """Return the sections that fit into `most` bytes, taken in turn unless they need one that does not fit,
+    and the others."""
+    fit: list[WrittenSection] = []
+    others: list[WrittenSection] = []
+    for written in sections:
+        left_out = any(_needs(written.section, other.section) for other in others)
+        if left_out or len(written.data) > most:
+            others.append(written)
+        else:
+            fit.append(written)
+            most -= len(written.data)
+    return fit, others
+
+
 def _cut(sections: Sequence[WrittenSection], n_before: int, n_behind: int) -> Iterator[WrittenPart]:
-    """Yield parts made of successive sections, none of them empty."""
-    ends = n_before + np.cumsum([len(written.data) for written in sections])
-    firsts = [0]
+    """Yield parts, none of them empty."""
+    sizes = [len(written.data) for written in sections]
+    total = n_before + sum(sizes) + n_behind
     kinds = [(section.grid, section.kind) for section, _ in sections]
-    whole = kinds.index(("features", "symbols")) + 1  # the fewest sections that can be shown
+    n_shown = kinds.index(("features", "symbols")) + 1  # the fewest sections that can be shown
+    n_read, number = n_before, 0
     for share in SHARES:
-        most = share * (ends[-1] + n_behind)
-        n = int(np.searchsorted(ends, most, side="right"))
-        if n > firsts[-1] and n >= whole:
-            firsts.append(n)
-    for number, (first, end) in enumerate(pairwise(firsts)):
-        some = sections[first:end]
-        part = Part(part_name(number), tuple(written.section for written in some))
-        yield WrittenPart(part, b"".join(written.data for written in some))
+        if n_before + sum(sizes[:n_shown]) > share * total:
+            continue
+        fit, sections = _that_fit(sections, share * total - n_read)
+        if fit:
+            fit.sort(key=_place_in_part)
+            data = b"".join(written.data for written in fit)
+            yield WrittenPart(Part(part_name(number), tuple(written.section for written in fit)), data)
+            n_read, number = n_read + len(data), number + 1

@@ -22,7 +22,7 @@ from vfr_bake.config import BakeConfig
 from vfr_bake.presets import PAGE_MB, BakeChoice, Preset
 from vfr_bake.training.length.witness_loss import Loss
 
-MANIFEST_BYTES = 20_000
+MANIFEST_BYTES = 25_000
 """Bytes reserved for the manifest if the asset has to fit into a number of bytes."""
 CELL_BYTES = 0.1
 """Least bytes for a stored feature cell with its densities: with fewer bytes per cell, coarser grids look
@@ -53,7 +53,7 @@ def cells_that_fit(max_mb: float, others: int) -> int:
     bytes are taken by other data.
 
     >>> cells_that_fit(3.0, 300_000)
-    26800000
+    26750000
     """
     return max(int((max_mb * 1e6 - others - MANIFEST_BYTES) / CELL_BYTES), FEWEST_CELLS)
 
