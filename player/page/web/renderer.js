@@ -183,16 +183,13 @@ export class Renderer {
 
   // Return the feature lookups per ray and the base steps per sample of a view's quality. Lookups are limited as the bake
   // found. They are not limited where it found 0, which means that fewer lookups lose too much, nor in older assets, where
-  // it did not look for limits. Samples twice as long would cost lego, whose base steps are three cells long, 2.9 dB; so
-  // `fast` has them only if a base step is at most one cell long, and not if the bake found that nothing may be left out.
+  // it did not look for limits.
   quality(view) {
-    const { manifest } = this.scene, { n_fetches: k, level_steps: steps } = manifest;
-    const [high, fast] = manifest.quality_fetches ?? [0, 0];
+    const { n_fetches: k, level_steps: steps, quality_fetches: limits } = this.scene.manifest;
+    const [high, fast] = limits ?? [0, 0];
     const most = { exact: 0, high, fast }[view.quality ?? "high"];
     const fetches = Math.min(most || k, k || most); // 0 is no limit in both
-    const cells = Math.max(...this.constant.uCellsPerUnit) * manifest.step;
-    const coarser = view.quality === "fast" && cells <= 1 && (fast || manifest.agreement[1]) ? 2 : 1;
-    const uLevelSteps = Array.from({ length: 8 }, (_, level) => (steps[level] ?? 1) * coarser);
+    const uLevelSteps = Array.from({ length: 8 }, (_, level) => steps[level] ?? 1);
     return { uFetches: view.n_fetches ?? fetches, uLevelSteps, uLongestStep: Math.max(...uLevelSteps) };
   }
 

@@ -412,26 +412,29 @@ def test_a_picture_keeps_no_memory(page: RenderPage, asset: Asset) -> None:
     assert found == [1, 0]
 
 
+LIMIT = "(limits) => Object.assign(renderer.scene.manifest, { quality_fetches: limits })"
+"""JavaScript that sets the limits on the lookups of high and fast pictures."""
+
+
 def test_coarser_qualities_fetch_less_and_look_alike(page: RenderPage, asset: Asset) -> None:
     camera = scenes.cameras(asset)["outside"]
     costs, pictures = [], []
+    page.page.evaluate(LIMIT, [4, 2])
     for quality in ("exact", "high", "fast"):
         found = page.page.evaluate("view => counts(view)", view_of(camera) | {"quality": quality})
         costs.append(int(page.array(found["fetches"], np.uint32).sum()))
         pictures.append(page.picture(camera, quality=quality).astype(float))
+    page.page.evaluate(LIMIT, None)
     assert costs[0] >= costs[1] > costs[2]
     errors = [np.mean((some - pictures[0]) ** 2) for some in pictures[1:]]
     assert errors[0] <= errors[1] < 50
 
 
-QUALITIES = """([changes, finest]) => {
-  const { scene, constant } = renderer, { manifest } = scene;
-  const cells = constant.uCellsPerUnit;
+QUALITIES = """(changes) => {
+  const { scene } = renderer, { manifest } = scene;
   scene.manifest = { ...manifest, ...changes };
-  if (finest) constant.uCellsPerUnit = cells.map(() => 1 / manifest.step); // a base step is one cell long
   const found = ["exact", "high", "fast"].map((quality) => renderer.quality({ quality }));
   scene.manifest = manifest;
-  constant.uCellsPerUnit = cells;
   return found.map(({ uFetches, uLongestStep }) => [uFetches, uLongestStep]);
 }"""
 """JavaScript that returns the lookups and the longest step of each quality for a changed manifest."""
@@ -454,17 +457,9 @@ def test_qualities_keep_to_the_lookups_that_the_bake_found(
     """The manifest's `quality_fetches` limit the lookups, and 0 is no limit; without them, as in assets of
     earlier versions, there is none either."""
     changes = {"n_fetches": n_fetches} | ({} if limits is None else {"quality_fetches": limits})
-    found = page.page.evaluate(QUALITIES, [changes, False])
+    found = page.page.evaluate(QUALITIES, changes)
     assert [lookups for lookups, _ in found] == lookups
-
-
-@pytest.mark.parametrize(("fetches", "agreement", "longer"), [(0, 0, 1), (4, 0, 2), (0, 28, 2)])
-def test_fast_pictures_are_exact_ones_if_nothing_may_be_left_out(
-    page: RenderPage, fetches: int, agreement: float, longer: int
-) -> None:
-    changes = {"quality_fetches": [0, fetches], "agreement": [0, agreement]}
-    (exact, step), _, (fast, fast_step) = page.page.evaluate(QUALITIES, [changes, True])
-    assert fast == (fetches or exact) and fast_step == longer * step
+    assert len({step for _, step in found}) == 1, "longer steps lose too much: fox 0.6 dB, lego 2.9 dB"
 
 
 @pytest.mark.parametrize(
