@@ -14,12 +14,13 @@ Files of `player/page/web`:
 - `style.css` is the style.
 - `index.html` is the page. In it, `{{title}}` and `{{advice}}`, which says what to do where the data are not
   beside the page, are replaced by text, `{{poster}}` by an address for `src`, and `{{policy}}`, `{{style}}`,
-  `{{data}}` and `{{script}}` by whole elements.
+  `{{script}}`, `{{viewer}}` and `{{data}}` by whole elements.
 
 The compressed script is the element with the id `viewer`. `boot.js` unpacks it to an element with the id
 `script`, whose text the worker runs as well. In the one file, each file of the data is an element
 `<script type="text/plain" data-file="NAME">`: the manifest as it is, with its SHA-256 in `data-sha256`, and
-the others as text. The scripts come before the data, so that they can tell where the data are cut short.
+the others as text. `boot.js` stands in the head and runs when the page has arrived, so that it can tell where
+the page is cut short.
 """
 
 from __future__ import annotations
@@ -154,8 +155,8 @@ def _around_data(
         "style": f"<style>{style}</style>",
         "poster": poster,
         "advice": advice,
-        "script": f'<script type="text/plain" id="viewer" data-bytes="{len(packed)}">{viewer}</script>\n'
-        f'<script type="module">{boot}</script>',
+        "script": f'<script type="module">{boot}</script>',
+        "viewer": f'<script type="text/plain" id="viewer" data-bytes="{len(packed)}">{viewer}</script>',
     }
     before, behind = (_ascii_html(_filled(half, filled)) for half in sources[INDEX].split("{{data}}"))
     return before, behind
@@ -228,7 +229,7 @@ def data_elements(files: Mapping[str, bytes]) -> bytes:
 
 def _stripped(name: str, text: str) -> str:
     if name.endswith(".css"):
-        return re.sub(r"(?<=[{}:;,])\s+", "", without_comments(text))
+        return re.sub(r"(?<=[{}:;,])\s+|\s+(?={)", "", without_comments(text))
     return without_comments(text) if name.endswith((".js", ".glsl")) else text
 
 

@@ -7,9 +7,10 @@
 import { bytesOf } from "./text_bytes.js";
 
 const CHANGED = "the page was cut short or changed on its way";
+const NOT_RUN = "its script was changed on its way, or cannot run in this browser";
 
 async function unpacked(element) {
-  const bytes = bytesOf(element.textContent, Number(element.dataset.bytes));
+  const bytes = element && bytesOf(element.textContent, Number(element.dataset.bytes));
   if (!bytes) throw new Error(CHANGED);
   const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("deflate"));
   return new Response(stream).text().catch(() => {
@@ -23,7 +24,7 @@ async function begin() {
   script.id = "script";
   script.textContent = await unpacked(document.getElementById("viewer"));
   document.body.append(script);
-  if (window.vfr === early) throw new Error(CHANGED); // it did not run: the policy allows no changed script
+  if (window.vfr === early) throw new Error(NOT_RUN); // the policy allows no changed script
   Object.defineProperties(early, Object.getOwnPropertyDescriptors(window.vfr));
   return window.vfr.ready;
 }
@@ -42,5 +43,6 @@ early.ready.catch(({ message }) => {
   const status = document.getElementById("status");
   if (status.textContent) return; // the viewer has reported it already
   document.body.classList.add("failed");
-  status.textContent = `This scene cannot be shown here: ${message}. Open this page in a current Chrome, Edge, Firefox or Safari.`;
+  const advice = message === CHANGED ? "Load it again, or ask for it anew" : "Open this page in a current Chrome, Edge, Firefox or Safari";
+  status.textContent = `This scene cannot be shown here: ${message}. ${advice}.`;
 });

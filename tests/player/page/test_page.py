@@ -455,12 +455,15 @@ def test_data_that_end_too_soon_are_not_taken_for_a_lack_of_memory(
 
 def test_a_page_that_was_cut_short_says_so(chromium: Browser, asset: Asset, tmp_path: Path) -> None:
     whole, path = page(asset), tmp_path / "cut.html"
-    for share in (0.9, 0.6):
-        path.write_bytes(whole[: int(len(whole) * share)])
+    poster, viewer = whole.index(b'id="poster"'), whole.index(b'id="viewer"')
+    for end in (poster + 1000, viewer, viewer + 20_000, int(len(whole) * 0.6), int(len(whole) * 0.9)):
+        path.write_bytes(whole[:end])
         with opened(chromium, path.as_uri()) as found:
             found.page.wait_for_function("() => document.body.innerText.includes('cannot be shown here')")
-            assert "cut short" in found.page.inner_text("body")
-            assert found.page.evaluate("() => document.getElementById('poster').naturalWidth") > 0
+            said = found.page.inner_text("body")
+            assert "cut short" in said and "ask for it anew" in said
+            has_poster = "() => document.getElementById('poster')?.naturalWidth > 0"
+            assert found.page.evaluate(has_poster) == (end >= viewer)
             told = found.page.evaluate("() => vfr.ready.then(() => null, (error) => error.message)")
             assert "cut short" in told
 

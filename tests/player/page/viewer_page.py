@@ -79,6 +79,7 @@ def page_files(loader: str, poster: bytes = b"") -> dict[str, bytes]:
         "poster": "poster.jpg"
         if poster
         else "data:image/gif;base64,R0lGODlhAQABAIAAAP///wAAACwAAAAAAQABAAACAkQBADs=",
+        "viewer": "",
         "data": "",
         "script": '<script type="module" src="main.js"></script>',
     }
