@@ -140,7 +140,7 @@ export class Viewer {
     const { clientWidth, clientHeight } = this.canvas;
     const view = this.view(clientWidth, clientHeight);
     this.touch();
-    const t = await this.renderer.depthAt({ ...view, quality: this.quality }, x, y);
+    const t = await this.renderer.depthAt({ ...view, quality: this.quality }, x, y).catch(() => null); // the context is lost
     if (t !== null) this.fly(aimed(this.frame, this.pose, pointAt(view, x, y, t)));
   }
 

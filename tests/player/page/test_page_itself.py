@@ -136,6 +136,7 @@ def test_a_drag_layers_and_a_lost_context(chromium: Browser, file: Path) -> None
             """() => {
               const gl = canvas.getContext("webgl2").getExtension("WEBGL_lose_context");
               gl.loseContext();
+              dispatchEvent(new KeyboardEvent("keydown", { key: "c" })); // does nothing now
               setTimeout(() => gl.restoreContext(), 300);
             }"""
         )
