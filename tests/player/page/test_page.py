@@ -144,7 +144,7 @@ def test_a_page_is_plain_and_names_what_runs(asset: Asset, make: Callable[..., W
     text = made.files["index.html"].decode("ascii")
     before, _, behind = text.partition("</title>")
     assert before.endswith("<title>&lt;/title&gt;&lt;script&gt;alert(&quot;x&quot;)&lt;/script&gt;")
-    assert "alert(" not in behind
+    assert "alert(" not in behind and '<link rel="icon" href="data:,">' in behind, "no request for an icon"
     (policy,) = re.findall(r'Content-Security-Policy" content="([^"]*)"', text)
     rules = dict(rule.strip().partition(" ")[::2] for rule in policy.split(";"))
     assert rules["default-src"] == "'none'" and rules["connect-src"] == beside and "unsafe" not in policy
