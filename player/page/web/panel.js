@@ -70,7 +70,11 @@ export class Panel {
       fly: () => press("fly", (controls.flies = !controls.flies)),
       save: () => this.save().catch((error) => this.say(error.message)),
       full: () => this.fullScreen(),
-      help: () => element("card").showModal(),
+      help: () => {
+        const card = element("card");
+        card.showModal();
+        card.scrollTop = 0; // the browser scrolls to the button at its end, which has the focus
+      },
     };
     const keys = {
       Home: actions.home, " ": actions.turn, g: actions.fly, p: actions.save, f: actions.full, "?": actions.help,

@@ -103,6 +103,13 @@ def test_nothing_covers_the_picture(chromium: Browser, window: dict[str, Any]) -
             assert box["x"] >= 0 and box["x"] + box["width"] <= width
 
 
+def test_the_help_card_begins_at_its_top_in_a_small_window(chromium: Browser) -> None:
+    with opened(chromium, FILES, "#turn=off", viewport={"width": 600, "height": 300}) as (page, *_):
+        page.keyboard.press("?")
+        place = page.locator("#card").evaluate("e => [e.scrollTop, e.scrollHeight - e.clientHeight]")
+        assert place[0] == 0 < place[1]
+
+
 def test_options_in_the_address(chromium: Browser) -> None:
     with opened(chromium, FILES, "#view=2&quality=exact&noui&background=255,0,0") as (page, *_):
         view = still(page)
