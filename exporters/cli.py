@@ -175,7 +175,7 @@ def _sentence(summary: dict[str, Any]) -> str:
     parts += summary.get("notes", [])
     if "viewer_bytes" in summary:
         parts.append(f"{summary['viewer_bytes'] / 1e3:.0f} kB of it the viewer")
-        parts.append(f"{summary['gpu_bytes'] / 1e6:.0f} MB of graphics memory")
+        parts.append(f"{-(-summary['gpu_bytes'] // 10**6)} MB of graphics memory")
     if "bounds" in summary:
         parts.append(f"bounds {corners_text(summary['bounds'])}")
     if "level" in summary:

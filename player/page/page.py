@@ -183,14 +183,15 @@ def _checked_gpu_bytes(asset: Asset, max_gpu_mb: int | None) -> int:
     needed = decoding_bytes(asset)
     if needed > MOST_DECODING_BYTES:
         raise ConfigError(
-            f"{asset.folder}: memory to unpack the scene: expected at most {MOST_DECODING_BYTES / 1e6:.0f} "
-            f"MB, which browsers give a page, got {needed / 1e6:.0f} MB: bake it smaller (vfr-bake --preset)"
+            f"{asset.folder}: memory to unpack the scene: expected at most {MOST_DECODING_BYTES // 10**6} "
+            f"MB, which browsers give a page, got {-(-needed // 10**6)} MB: bake it smaller "
+            "(vfr-bake --preset)"
         )
     found = gpu_bytes(asset)
     if max_gpu_mb is not None and found > max_gpu_mb * 1_000_000:
         raise ConfigError(
             f"{asset.folder}: graphics memory: expected at most {max_gpu_mb} MB, got "
-            f"{found / 1e6:.0f} MB: bake it smaller (vfr-bake --preset), or allow more (--max-gpu-mb)"
+            f"{-(-found // 10**6)} MB: bake it smaller (vfr-bake --preset), or allow more (--max-gpu-mb)"
         )
     return found
 

@@ -15,6 +15,7 @@ import pytest
 from PIL import Image
 from playwright.sync_api import Browser, Page
 
+from exporters.cli import main
 from exporters.export import export_asset
 from exporters.options import ExportOptions
 from player.asset.asset import Asset
@@ -246,3 +247,19 @@ def test_no_page_but_an_exported_one_is_refused_for_its_graphics_memory(
         assert answer.read() == inline(asset).content == page_of(asset)
     with pytest.raises(ConfigError, match=r"expected at most 512 MB, got 600 MB: .* more \(--max-gpu-mb\)"):
         export_asset(asset.folder, tmp_path / "scene.html")
+
+
+def test_memory_is_told_in_megabytes_that_suffice(
+    asset: Asset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Memory is rounded up: a page that is refused never seems to take what it may take at most, and may be
+    exported with the number that is told."""
+    for name in ("gpu_bytes", "decoding_bytes"):
+        monkeypatch.setitem(page_of.__globals__, name, lambda asset: 47_000_001)
+    with pytest.raises(ConfigError, match="graphics memory: expected at most 47 MB, got 48 MB"):
+        export_asset(asset.folder, tmp_path / "scene.html", ExportOptions(max_gpu_mb=47))
+    assert main([str(asset.folder), str(tmp_path / "scene.html"), "--max-gpu-mb", "48"]) == 0
+    assert "48 MB of graphics memory" in capsys.readouterr().out
+    monkeypatch.setitem(page_of.__globals__, "MOST_DECODING_BYTES", 47_000_000)
+    with pytest.raises(ConfigError, match=r"unpack the scene: expected at most 47 MB, .* got 48 MB"):
+        page_of(asset)
