@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from player.app.parts_info import what_it_adds
+from player.app.parts_info import parts_facts
 from player.asset.asset import Asset
 from player.asset.manifest import Manifest
 from player.asset.pyramid import PyramidValues
@@ -49,7 +49,7 @@ def facts(asset: Asset) -> dict[str, Any]:
         "n_parts": len(m.parts),
         "n_parts_read": asset.n_parts,
         "missing": asset.missing,
-        "parts": [{"file": part.file, "bytes": part.bytes, "adds": what_it_adds(part)} for part in m.parts],
+        "parts": parts_facts(m),
         "levels": {grid: _levels(getattr(asset.arrays, grid)) for grid in ("densities", "features")},
         "head_parameters": asset_head(asset).n_parameters,
         "n_cameras": len(asset_cameras(asset)),
@@ -78,7 +78,8 @@ def page(folder: Path, m: Manifest, known: dict[str, Any]) -> list[str]:
             for name, n in sorted(known["bytes"].items(), key=lambda item: -item[1])
         ]),
         *_section("parts, each of which makes the picture sharper", [
-            (part["file"], f"{_megabytes(part['bytes']):>9}  {part['adds']}") for part in known["parts"]
+            (part["file"], f"{_megabytes(part['bytes']):>9}  {_up_to(part)}{part['adds']}")
+            for part in known["parts"]
         ]),
         *_section("scene", [
             ("inner region" if m.contracted else "world box",
@@ -107,6 +108,13 @@ def page(folder: Path, m: Manifest, known: dict[str, Any]) -> list[str]:
         ("pictures", f"{command} --orbit 60 --output frames/"),
     ])  # fmt: skip
     return [printable(line) for line in lines]
+
+
+def _up_to(part: dict[str, Any]) -> str:
+    """Describe what is read up to the end of a part, and how good its picture is."""
+    loss = part["loss_db"]
+    below = "" if loss is None else f", {loss:.1f} dB below the whole"
+    return f"first {part['share_read']:.0%} of the bytes{below}: "
 
 
 def _section(title: str, rows: list[tuple[str, str]]) -> list[str]:

@@ -2,10 +2,50 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from itertools import groupby
+from itertools import accumulate, groupby
+from typing import Any
 
+from player.asset.manifest import Manifest
 from player.asset.sections import Part, Section
+
+
+def parts_facts(manifest: Manifest) -> list[dict[str, Any]]:
+    """Return the facts of each part: `file`, `bytes`, what it `adds`, `bytes_read` up to its end, head and
+    cameras included, `share_read`, their share of all bytes but the reports', and `loss_db`, by how much the
+    picture up to it is below the whole one; None if the bake has not recorded that for these parts."""
+    files = {name: entry.bytes for name, entry in manifest.files.items() if not name.startswith("report.")}
+    first = files.get("head.onnx", 0) + files.get("cameras.json", 0)
+    read = list(accumulate((part.bytes for part in manifest.parts), initial=first))[1:]
+    total = max(sum(files.values()), 1)
+    rows = zip(manifest.parts, read, _losses(manifest), strict=True)
+    return [
+        {
+            "file": part.file,
+            "bytes": part.bytes,
+            "adds": what_it_adds(part),
+            "bytes_read": n_read,
+            "share_read": n_read / total,
+            "loss_db": loss,
+        }
+        for part, n_read, loss in rows
+    ]
+
+
+def _losses(manifest: Manifest) -> list[float | None]:
+    """Return the losses that the bake recorded in the provenance, which may hold anything; they belong to
+    other parts if the asset was written again."""
+    baked = manifest.provenance.get("baked")
+    found = baked.get("parts") if isinstance(baked, dict) else None
+    found = [part for part in found if isinstance(part, dict)] if isinstance(found, list) else []
+    losses = [part.get("loss_db") for part in found]
+    whole = len(manifest.parts) == len(found) + 1 and all(
+        part.bytes == one.get("bytes") for part, one in zip(manifest.parts, found, strict=False)
+    )
+    if not whole or not all(isinstance(loss, float) and math.isfinite(loss) for loss in losses):
+        return [None] * len(manifest.parts)
+    return [*losses, 0.0]
 
 
 def what_it_adds(part: Part) -> str:
@@ -51,4 +91,6 @@ def _of_features(symbols: Sequence[Section]) -> list[str]:
 
 def _levels(levels: Sequence[int]) -> str:
     most, least = max(levels), min(levels)
+    if len(set(levels)) < most - least + 1:
+        return f"levels {', '.join(map(str, sorted(set(levels), reverse=True)))}"
     return f"level {least}" if most == least else f"levels {most} to {least}"

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import time
 from bisect import bisect_left
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, replace
 from functools import partial
@@ -55,7 +55,7 @@ from vfr_bake.baking.grids import (
     some_features,
 )
 from vfr_bake.baking.head import fold_head, runner, small_head
-from vfr_bake.baking.held_out import BETWEEN, HeldOut, Stage, views_between
+from vfr_bake.baking.held_out import BETWEEN, HeldOut, Shown, Stage, views_between
 from vfr_bake.baking.limits import (
     MANIFEST_BYTES,
     LossMissedError,
@@ -188,12 +188,14 @@ class _Bake:
         def finish(new: Path) -> dict[str, bytes]:
             """Return the mesh and the report as files; the mesh comes last because its size limit depends on
             the other files. `figures` is part of the manifest, which is written again after this."""
+            coarser = self.held_out.first_parts(new, self.n_fetches, self.config.memory)
             asset = Asset.open(new, verify=True, max_memory=self.config.memory)
             mesh, removed = self._mesh(asset, file_sizes(new))
             figures["mesh_faces"], figures["mesh_floaters_removed"] = len(mesh.faces), removed.floaters
             data = small_ply_bytes(mesh)
-            report = self._judge(asset, file_sizes(new) | {"mesh.ply": len(data)}, folder.name)
+            report = self._judge(asset, coarser, file_sizes(new) | {"mesh.ply": len(data)}, folder.name)
             made.append(report)
+            figures["parts"] = report.parts
             files = report.with_files(replace(asset.manifest, provenance=manifest.provenance), data)
             timed = self.config.target_ms is not None
             ms = frame_ms(asset, self.model.cameras[0], self.n_fetches) if timed else None
@@ -447,9 +449,16 @@ class _Bake:
         """Return the settings as resolved, among them the memory, which depends on the machine."""
         return asdict(self.config) | asdict(self.choice) | {"max_memory": self.config.memory}
 
-    def _judge(self, asset: Asset, n_bytes: dict[str, int], name: str) -> BakeReport:
-        """Play the written files, which have the sizes `n_bytes`, and report the result."""
+    def _judge(
+        self, asset: Asset, coarser: Sequence[Shown], n_bytes: dict[str, int], name: str
+    ) -> BakeReport:
+        """Play the written files, which have the sizes `n_bytes`, and report the result; `coarser`: what
+        their first parts show."""
         last = self.held_out.measure("files", asset.grid, Head.of(asset), self.n_fetches)
+        parts = [
+            {"bytes": part.bytes, "loss_db": round(self.held_out.lost(last.shown, shown).db, 2)}
+            for part, shown in zip(asset.manifest.parts, coarser, strict=False)  # without the last part
+        ]
         preset = self.choice.preset
         gpu_bytes, missed = page_memory(asset, preset)
         if last.loss.spread is None:
@@ -467,8 +476,8 @@ class _Bake:
         seconds = self.seconds | {LAST_PART: time.monotonic() - self._begun - sum(self.seconds.values())}
         return BakeReport(
             f"{name}: baked with preset {preset}", self._asked(), self.held_out.table(),
-            self.held_out.measured_on(), n_bytes, seconds, self.left_out, self.lookups, missed, gpu_bytes,
-            pictures,
+            self.held_out.measured_on(), n_bytes, seconds, self.left_out, self.lookups, parts, missed,
+            gpu_bytes, pictures,
         )  # fmt: skip
 
     @contextmanager

@@ -18,15 +18,18 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from player.asset.asset import Asset, read_manifest
 from player.asset.grid import SparseGrid
 from player.cameras.camera import Camera, focus_point
 from player.cameras.keyframes import camera_on_path
 from player.cameras.rotations import rotation_matrix
-from player.errors import TrainingError
+from player.errors import ConfigError, TrainingError
+from player.head.head import Head as AssetHead
 from player.march.march import MIN_OPACITY, MarchResult
 from player.render import choose_march
 from vfr_bake.data.threads import in_threads
@@ -334,6 +337,18 @@ class HeldOut:
     def look(self, name: str, grid: SparseGrid, head: Head, n_fetches: int) -> Stage:
         """Play `grid` with `head`, without appending the result to the stages."""
         return self._stage(name, self.march(grid, n_fetches), head)
+
+    def first_parts(self, folder: Path, n_fetches: int, max_memory: float) -> list[Shown]:
+        """Play the first part of the asset in `folder`, then the first two, and so on up to the last but one,
+        as far as each fits into `max_memory` gigabytes."""
+        found = []
+        for n_parts in range(1, len(read_manifest(folder).parts)):
+            try:
+                asset = Asset.open(folder, max_memory=max_memory, parts=n_parts)
+            except ConfigError:
+                break  # the symbols that later parts add to take memory that the whole asset does not
+            found.append(self.look("first parts", asset.grid, AssetHead.of(asset), n_fetches).shown)
+        return found
 
     def _stage(self, name: str, played: MarchResult, head: Head) -> Stage:
         hits = played.hits

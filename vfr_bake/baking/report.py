@@ -92,6 +92,9 @@ class BakeReport:
     lookups: dict[str, float]
     """Loss in dB of each number of feature lookups a ray, compared with a lookup at every sample; empty if
     the number was given."""
+    parts: list[dict[str, Any]]
+    """For each part of the asset but the last, `bytes` of its file, and `loss_db` of the picture of the parts
+    up to it, compared with the whole asset's."""
     missed: list[str]
     """The targets that were missed, in words; empty if all were met."""
     gpu_bytes: int | None
@@ -114,7 +117,9 @@ class BakeReport:
 
     def json(self) -> bytes:
         """Return the content of report.json."""
-        names = ("asked", "stages", "measured_on", "seconds", "left_out", "lookups", "missed", "gpu_bytes")
+        names = (
+            "asked", "stages", "measured_on", "seconds", "left_out", "lookups", "parts", "missed", "gpu_bytes",
+        )  # fmt: skip
         document = {name: getattr(self, name) for name in names} | {"bytes": self.n_bytes}
         document |= {name: self.stages[-1][name] for name in ("loss_db", "loss_db_spread")}
         return (json.dumps(document, indent=1, sort_keys=True, allow_nan=False) + "\n").encode()
@@ -126,6 +131,7 @@ class BakeReport:
         of_page = ""
         if self.gpu_bytes is not None:
             of_page = f" A page of it takes {self.gpu_bytes / 1e6:.0f} MB of graphics memory."
+        shown = {f"part {i}": part["loss_db"] for i, part in enumerate(self.parts)}
         lookups = f"<h2>Lookups a ray: loss against all</h2>{bars(self.lookups, 'dB', 3)}"
         measured = last["loss_db_spread"] is not None
         loss = "loss" if measured else "expected loss"
@@ -148,6 +154,7 @@ class BakeReport:
             table([title_row(*titles), *stages]),
             lookups if self.lookups else "",
             f"<h2>Bytes</h2>{bars({name: size / 1e6 for name, size in self.n_bytes.items()}, 'MB', 2)}",
+            f"<h2>Picture of the first parts: loss against all</h2>{bars(shown, 'dB', 2)}" if shown else "",
             f"<h2>Time</h2>{bars(self.seconds, 's', 0)}",
             f"<h2>What was left out</h2>{_pairs(self.left_out)}",
             f"<h2>Pictures</h2><p>Full model, played from the files, difference (white: {BRIGHTEST_ERROR:g} "

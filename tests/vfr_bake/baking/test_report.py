@@ -12,9 +12,12 @@ import pytest
 
 from player.asset.asset import read_manifest
 from player.asset.manifest import file_entry, manifest_bytes
-from vfr_bake.baking.held_out import expected_loss
+from vfr_bake.baking.bake import bake
+from vfr_bake.baking.held_out import HeldOut, expected_loss
 from vfr_bake.baking.mesh import LISTED_BYTES
 from vfr_bake.baking.report import BakeReport, Pictures, bars
+from vfr_bake.config import BakeConfig
+from vfr_bake.training.model_file import Model
 
 STAGE = {"psnr": 40.0, "loss_db": 0.5, "loss_db_spread": 0.03, "samples_median": 5.0, "samples_p95": 9.0}
 
@@ -29,6 +32,7 @@ def report(**changes: object) -> BakeReport:
         "seconds": {"grid": 1.5},
         "left_out": {"head": "256 wide, this one is <64>"},
         "lookups": {"1": 0.5, "2": 0.125},
+        "parts": [{"bytes": 1000, "loss_db": 6.25}],
         "missed": [],
         "gpu_bytes": 40_000_000,
         "pictures": [Pictures("view", np.zeros((8, 9, 3)), np.ones((8, 9, 3)))],
@@ -116,3 +120,16 @@ def test_expected_loss_is_that_of_independent_errors() -> None:
     alone, both = (-10 * np.log10(np.mean(e**2)) for e in (of_model, of_model + of_bake))
     assert expected_loss(float(np.mean(of_bake**2)), float(alone)) == pytest.approx(alone - both, abs=0.01)
     assert expected_loss(0.0, 30.0) == 0
+
+
+def test_the_bake_measures_what_its_first_parts_show(model: Model, tmp_path: Path) -> None:
+    settings = BakeConfig(preset="fast", resolution=144, mesh_resolution=32, refine_steps=0, check_views=1)
+    result = bake(model, tmp_path / "asset", settings, lambda *_: None)
+    parts = json.loads((tmp_path / "asset" / "report.json").read_text())["parts"]
+    manifest = read_manifest(tmp_path / "asset")
+    assert manifest.provenance["baked"]["parts"] == parts == result.figures["parts"]
+    assert [part["bytes"] for part in parts] == [part.bytes for part in manifest.parts[:-1]]
+    assert parts and parts[0]["loss_db"] > 1
+    held_out = HeldOut(model, 1)
+    assert len(held_out.first_parts(tmp_path / "asset", 1, 4.0)) == len(parts)
+    assert held_out.first_parts(tmp_path / "asset", 1, 1e-4) == [], "parts that take more memory are left out"
