@@ -25,7 +25,7 @@ export function raysOf(view, manifest) {
   const [low, high] = manifest.aabb;
   const middle = low.map((x, i) => (x + high[i]) / 2), radius = Math.hypot(...low.map((x, i) => high[i] - x)) / 2;
   const way = sum(middle, -1, eye), distance = Math.hypot(...way);
-  const start = !manifest.contracted && distance > FAR_AWAY * radius ? distance - radius : 0;
+  const start = distance > FAR_AWAY * radius ? distance - radius : 0;
   const ahead = -dot(way, back);
   let pixel = [view.cx, view.cy];
   if (start && ahead > 0.01 * distance) {

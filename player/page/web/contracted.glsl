@@ -27,7 +27,7 @@ void enter(vec3 origin, vec3 direction) {
   rayNearest = origin + rayT * direction;
   rayWidth = max(1.0, length(rayNearest));
   rayAlong = rayWidth * direction;
-  float start = uNear - rayT, far = length(vec2(start, rayWidth));
+  float start = uNear - uStart - rayT, far = length(vec2(start, rayWidth));
   rayCos = rayWidth / far;
   raySin = start / far;
   rayLength = MOST_ANGLE - atan(start, rayWidth);

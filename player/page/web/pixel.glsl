@@ -3,7 +3,7 @@
 // are replaced by code that program.js writes.
 
 uniform vec3 uOrigin;
-uniform float uStart, uScale;
+uniform float uScale;
 uniform vec2 uDepths;
 uniform mat3 uWorldFromModel;
 

@@ -2,6 +2,7 @@
 
 uniform vec3 uCentre, uAcross, uDown;
 uniform vec2 uPixel, uRows, uTile;
+uniform float uStart; // how far from the camera rays begin
 
 // Return the unit direction of the ray through a place in the tile that is drawn, and set turnedBy to how far it differs
 // from uCentre.

@@ -120,7 +120,7 @@ def cameras(asset: Asset) -> dict[str, Camera]:
     middle, size = (low + high) / 2, float(np.max(high - low))
     along = np.eye(4)
     along[:3, 3] = middle + np.array([0, 0, 1.5 * size])
-    away = 20.0 if asset.manifest.contracted else 374.0  # as far as float32 directions are useful
+    away = 100.0 if asset.manifest.contracted else 374.0  # as far as float32 directions are useful
     far = look_at(tuple(middle + size * away * np.array([0.8, 0.5, 0.3])), tuple(middle))
     found = {
         "outside": camera(

@@ -335,3 +335,28 @@ def test_options_of_an_address(call: Call, text: str) -> None:
         key: value for key, value in call("optionsOf", text, module="hash.js").items() if value is not None
     }
     assert found == HASHES[text]
+
+
+@pytest.mark.parametrize("contracted", [False, True])
+def test_rays_of_a_camera_far_away_are_exact_near_the_scene(call: Call, contracted: bool) -> None:
+    """In float32, in which shaders compute, a ray passes the scene where it does in exact numbers."""
+    camera = Camera("", look_at((800.0, 500.0, 300.0), (0.0, 0.0, 0.0)), 64, 48, 4e4, 4e4, 32.0, 24.0)
+    manifest = {
+        "world_from_model": np.eye(4).tolist(), "aabb": [[-2.0] * 3, [2.0] * 3], "contracted": contracted,
+    }  # fmt: skip
+    rays = {
+        name: np.asarray(x, np.float32)
+        for name, x in call("raysOf", *as_json([camera]), manifest, module="camera.js").items()
+    }
+    eye = camera.c2w[:3, 3]
+    for place in ((0.5, 0.5), (31.5, 24.5), (7.5, 40.5), (63.5, 47.5)):
+        x, y = np.array(place, np.float32) - rays["uPixel"]
+        beside = x * rays["uAcross"] + y * rays["uDown"]
+        more = 2 * (rays["uCentre"] @ beside) + beside @ beside
+        norm = np.sqrt(1 + more)
+        turned = (beside - rays["uCentre"] * (more / (norm + 1))) / norm
+        origin, direction = rays["uOrigin"] + rays["uStart"] * turned, rays["uCentre"] + turned
+        nearest = origin - (origin @ direction) * direction
+        exact = camera.c2w[:3, :3] @ [(place[0] - 32) / 4e4, (24 - place[1]) / 4e4, -1]
+        exact /= np.linalg.norm(exact)
+        np.testing.assert_allclose(nearest, eye - (eye @ exact) * exact, atol=3e-6)
