@@ -118,7 +118,8 @@ class BakeReport:
     def json(self) -> bytes:
         """Return the content of report.json."""
         names = (
-            "asked", "stages", "measured_on", "seconds", "left_out", "lookups", "parts", "missed", "gpu_bytes",
+            "asked", "stages", "measured_on", "seconds", "left_out", "lookups", "parts", "missed",
+            "gpu_bytes",
         )  # fmt: skip
         document = {name: getattr(self, name) for name in names} | {"bytes": self.n_bytes}
         document |= {name: self.stages[-1][name] for name in ("loss_db", "loss_db_spread")}
