@@ -11,7 +11,8 @@ import pytest
 
 from player.app import cli
 from player.app.option_types import DEMO
-from player.asset.asset import Asset
+from player.asset.asset import Asset, read_manifest
+from player.asset.manifest import VERSION
 from player.page.page import page
 
 
@@ -19,6 +20,15 @@ def test_it_is_small_and_whole(capsys: pytest.CaptureFixture[str]) -> None:
     assert sum(path.stat().st_size for path in DEMO.iterdir()) < 3_000_000
     assert cli.main(["demo", "--check"]) == 0
     assert "FAILED" not in capsys.readouterr().out
+
+
+def test_it_is_baked_as_assets_are_today() -> None:
+    """Its bake states what qualities leave out and what parts show, and that it loses next to nothing."""
+    manifest = read_manifest(DEMO)
+    assert manifest.version == VERSION and manifest.quality_fetches is not None
+    baked = manifest.provenance["baked"]
+    assert len(baked["parts"]) == len(manifest.parts) - 1
+    assert baked["stages"][-1]["loss_db"] < 0.1
 
 
 def test_a_folder_of_that_name_is_another_asset(
