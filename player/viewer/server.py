@@ -21,6 +21,7 @@ from player.asset.asset import Asset
 from player.cameras.camera import focus_point, orbit, world_up
 from player.cameras.views import asset_cameras
 from player.errors import ConfigError, MissingExtraError
+from player.files.memory import allowed_bytes
 from player.render import (
     Background,
     March,
@@ -31,6 +32,7 @@ from player.render import (
     checked_samples,
 )
 from player.terminal import command_line, printable
+from player.threads import bounded_threads
 from player.viewer.growing import grow, tell_what_is_missing
 from player.viewer.pages import NO_PAGES, Pages
 from player.viewer.window import PictureChoices, Window
@@ -73,6 +75,11 @@ class ServeSettings:
             check_choice("quality", self.quality, get_args(Quality))
         if self.background is not None:
             object.__setattr__(self, "background", checked_background(self.background))
+        check_choice("march", self.march, get_args(March))
+        if self.threads is not None:
+            bounded_threads(self.threads)
+        if self.max_memory is not None:
+            allowed_bytes(self.max_memory)
         if self.background == "transparent":
             raise ConfigError("--background: expected a colour for the viewer, got transparent")
 

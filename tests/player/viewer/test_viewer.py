@@ -180,6 +180,9 @@ def test_settings_of_the_viewer_are_checked_when_they_are_made() -> None:
         ({"quality": "best"}, "quality: expected exact, high or fast, got best"),
         ({"background": "white"}, "background: expected three numbers in 0"),
         ({"background": "transparent"}, "expected a colour for the viewer, got transparent"),
+        ({"march": "cuda"}, "march: expected auto, numpy or numba, got cuda"),
+        ({"threads": 0}, "threads: expected at least 1, got 0"),
+        ({"max_memory": -1}, "max_memory: expected gigabytes, more than 0, got -1"),
     ):
         with pytest.raises(ConfigError, match=message):
             ServeSettings(**wrong)
