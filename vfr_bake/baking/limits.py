@@ -84,9 +84,10 @@ def page_memory(asset: Asset, preset: Preset) -> tuple[int | None, list[str]]:
         return None, [f"page: {error}: lower --resolution to make pages"]
     if n_bytes <= 1e6 * PAGE_MB[preset]:
         return n_bytes, []
+    megabytes = -(-n_bytes // 10**6)
     return n_bytes, [
         f"preset {preset}: expected a page that takes at most {PAGE_MB[preset]} MB of graphics memory, got "
-        f"{n_bytes / 1e6:.0f} MB: lower --resolution, or export with --max-gpu-mb {-(-n_bytes // 10**6)}"
+        f"{megabytes} MB: lower --resolution, or export with --max-gpu-mb {megabytes}"
     ]
 
 
