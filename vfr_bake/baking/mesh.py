@@ -76,7 +76,7 @@ def mesh_bytes(others: int, max_mb: float | None) -> int:
         max_mb: megabytes that the whole asset may take; None for no limit.
 
     >>> mesh_bytes(9_000_000, None), mesh_bytes(9_000_000, 9.5), mesh_bytes(9_000_000, 8.0)
-    (1000000, 499600, 0)
+    (1000000, 499200, 0)
     """
     left = np.inf if max_mb is None else max(int(max_mb * 1e6) - others - LISTED_BYTES, 0)
     return int(min(others // OTHERS, left))
