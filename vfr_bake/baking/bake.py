@@ -110,13 +110,13 @@ def bake(model: Model, folder: Path, config: BakeConfig, report: Report, force: 
     work = _Bake(model, config, report)
     try:
         return work.run(folder, force)
-    except LossMissedError as missed:
+    except LossMissedError:
         if config.preset is not None:
             raise
-        spent, lost = sum(work.seconds.values()), str(missed)
+    spent = sum(work.seconds.values())
     del work  # free its memory
     finer = _Bake(model, replace(config, preset="fidelity"), report)
-    finer.left_out["preset"] = f"balanced: {lost}"
+    finer.left_out["preset"] = f"balanced: it loses more than {config.max_loss_db:g} dB"
     result = finer.run(folder, force)
     return replace(result, seconds=result.seconds + spent)
 

@@ -2,12 +2,23 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 
 from tests.vfr_bake.baking.scenes import trained
 from vfr_bake.config import FieldOptions, TrainConfig
 from vfr_bake.data import demo
 from vfr_bake.training.model_file import Model
+
+SMALL: dict[str, Any] = {
+    "resolution": 48,
+    "feature_resolution": 48,
+    "mesh_resolution": 16,
+    "refine_steps": 0,
+    "check_views": 1,
+}
+"""Settings of a bake that takes a second."""
 
 
 @pytest.fixture(scope="session")  # files of other folders may run between two of this one
