@@ -14,8 +14,8 @@ import numpy as np
 
 from exporters.surface.one_level import one_level
 from player.asset.asset import Asset, GridArrays
-from player.asset.bricks import bricks_per_axis, dense_index, live_cells, stored_bits
-from player.asset.pyramid import Bricks, Pyramid, PyramidValues, packed_bits
+from player.asset.bricks import stored_bits
+from player.asset.pyramid import Bricks, Pyramid, PyramidValues, live_cells, packed_bits
 from player.errors import DataError
 from player.files.memory import allowed_bytes
 
@@ -53,11 +53,9 @@ def _inside(grid: PyramidValues) -> PyramidValues:
     (cells,), (vertices,), (values,) = grid.pyramid.levels, grid.pyramid.vertices, grid.values
     # Cells along a model unit; the middle of the box is two model units from its corner along each axis.
     edge = grid.pyramid.resolution / 4
-    coords = vertices.bricks.coords
     inside = stored_bits(vertices.bricks.masks)
     inside[inside] = np.linalg.norm(vertices.index / edge - 2, axis=-1) <= 1
-    index = dense_index(coords, bricks_per_axis(grid.pyramid.resolution))
-    whole = Bricks(coords, live_cells(coords, packed_bits(inside), index))
+    whole = live_cells(Bricks(vertices.bricks.coords, packed_bits(inside)))
     kept = Bricks(cells.coords, cells.masks & whole.masks_at(cells.coords)).without_empty()
     pyramid = Pyramid(grid.pyramid.resolution, (kept,))
     return PyramidValues(pyramid, (values[vertices.rows_of(pyramid.vertices[0].bricks)],))

@@ -1,11 +1,10 @@
-"""Bricks: the layout of a sparse set of grid vertices, and the cells that follow from the stored vertices.
+"""Bricks: the layout of a sparse set of grid vertices.
 
 A brick is 8 x 8 x 8 vertices; its coordinate is the vertex index >> 3, and bricks are sorted by (x, y, z).
 A brick's mask is eight 64-bit words: vertex (x, y, z) is bit `b = (x & 7) * 64 + (y & 7) * 8 + (z & 7)`, in
 word `b >> 6` (so the word is x & 7) at bit `b & 63`. Rows of values follow the set bits: by brick, then by b.
 
-A cell is named by its lowest vertex. Here it is live when all eight of its corners are stored, as in versions
-3.x of the format; a pyramid (`player.asset.pyramid`) stores masks of live cells with the same bits instead.
+A cell is named by its lowest vertex. Masks of live cells (`player.asset.pyramid`) have the same bits.
 """
 
 from __future__ import annotations
@@ -20,7 +19,6 @@ BRICK = 8
 Find = Callable[[np.ndarray], np.ndarray]
 _ALL = np.uint64(0xFFFFFFFFFFFFFFFF)
 _Y_FIRST = np.uint64(0xFF)  # the bits of a word with y = 0
-_Z_LAST = np.uint64(0x8080808080808080)  # the bits of a word with z = 7
 _Z_FIRST = np.uint64(0x0101010101010101)  # the bits of a word with z = 0
 
 
@@ -107,16 +105,6 @@ def dense_index(brick_coords: np.ndarray, n_per_axis: int) -> np.ndarray:
     return index
 
 
-def neighbours(brick_coords: np.ndarray, index: np.ndarray, offset: tuple[int, ...]) -> np.ndarray:
-    """Return the index [n] int32 of the brick at `offset` (components 0 or 1) from each coordinate, -1 where
-    there is none.
-
-    -1 addresses the last row, so append a row of zeros to the array that is gathered from.
-    """
-    padded = np.pad(index, ((0, 1),) * 3, constant_values=-1)
-    return padded[tuple((np.asarray(brick_coords, np.int64) + offset).T)]
-
-
 def with_apron(values: np.ndarray, brick_coords: np.ndarray, find: Find, out: np.ndarray) -> None:
     """Write the values of bricks with an apron to `out` [n, 9, 9, 9].
 
@@ -154,50 +142,3 @@ def with_corners(brick_coords: np.ndarray, brick_masks: np.ndarray, n_per_axis: 
         wanted = (words != 0) & ((before >= 0) & (before < n_per_axis)).all(axis=1)
         found[tuple(before[wanted].T)] = True
     return np.argwhere(found)
-
-
-def live_cells(brick_coords: np.ndarray, brick_masks: np.ndarray, index: np.ndarray) -> np.ndarray:
-    """Return masks [n_bricks, 8] uint64, laid out like `brick_masks`, of the cells with all eight corners
-    stored.
-
-    Corners are combined axis by axis: along z, then y, then x. A brick's last cells take their far corners
-    from the first layer of the next brick.
-
-    >>> coords, masks, _ = pack_vertices(np.argwhere(np.ones((9, 9, 9))))
-    >>> live = live_cells(coords, masks, dense_index(coords, 2))
-    >>> np.bitwise_count(live).sum(axis=1).tolist()
-    [512, 0, 0, 0, 0, 0, 0, 0]
-    """
-    zeros = np.zeros((1, BRICK), np.uint64)
-
-    def beyond(words: np.ndarray, offset: tuple[int, int, int]) -> np.ndarray:
-        return np.concatenate([words, zeros])[neighbours(brick_coords, index, offset)]
-
-    masks = np.asarray(brick_masks, np.uint64)
-    shift = [np.uint64(n) for n in (1, 7, 8, 56)]
-    along_z = ((masks >> shift[0]) & ~_Z_LAST) | ((beyond(masks, (0, 0, 1)) & _Z_FIRST) << shift[1])
-    live = masks & along_z
-    live = live & ((live >> shift[2]) | (beyond(live, (0, 1, 0)) << shift[3]))
-    return live & np.concatenate([live[:, 1:], beyond(live, (1, 0, 0))[:, :1]], axis=1)
-
-
-def corner_masks(brick_coords: np.ndarray, cells: np.ndarray, index: np.ndarray) -> np.ndarray:
-    """Return masks [n_bricks, 8] uint64, laid out like `cells`, of the corners of cells. The bricks must hold
-    all corners. For the cells that `live_cells` returned, `live_cells` of the result returns them again.
-
-    >>> coords, masks, _ = pack_vertices(np.argwhere(np.ones((9, 9, 9))))
-    >>> index = dense_index(coords, 2)
-    >>> bool((corner_masks(coords, live_cells(coords, masks, index), index) == masks).all())
-    True
-    """
-    zeros = np.zeros((1, BRICK), np.uint64)
-    padded = np.pad(index, ((1, 0),) * 3, constant_values=-1)
-    coords = np.asarray(brick_coords, np.int64) + 1
-
-    def before(words: np.ndarray, offset: tuple[int, int, int]) -> np.ndarray:
-        return np.concatenate([words, zeros])[padded[tuple((coords - offset).T)]]
-
-    one, seven, eight, fifty_six = (np.uint64(n) for n in (1, 7, 8, 56))
-    masks = cells | ((cells & ~_Z_LAST) << one) | ((before(cells, (0, 0, 1)) & _Z_LAST) >> seven)
-    masks = masks | (masks << eight) | (before(masks, (0, 1, 0)) >> fifty_six)
-    return masks | np.concatenate([before(masks, (1, 0, 0))[:, 7:], masks[:, :7]], axis=1)

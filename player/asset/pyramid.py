@@ -30,6 +30,7 @@ MAX_LEVELS = 8
 _ROWS_AT_ONCE = 1 << 18
 """Vertices whose symbols are found at a time: the temporaries are eight times as wide as the 8-bit codes."""
 
+_Z_FIRST = np.uint64(0x0101010101010101)  # the bits of a word with z = 0
 _Z_LAST = np.uint64(0x8080808080808080)  # the bits of a word with z = 7
 _ONE, _SEVEN, _EIGHT, _FIFTY_SIX = (np.uint64(n) for n in (1, 7, 8, 56))
 
@@ -234,6 +235,32 @@ def corners_of(cells: Bricks) -> Bricks:
     masks = masks | (masks << _EIGHT) | (behind(masks, 0, 1, 0) >> _FIFTY_SIX)
     before = np.concatenate([behind(masks, 1, 0, 0)[:, 7:], masks[:, :7]], axis=1)
     return Bricks(coords.astype(np.uint16), masks | before).without_empty()
+
+
+def live_cells(vertices: Bricks) -> Bricks:
+    """Return the cells with all eight corners among some vertices, as masks of bricks of cells.
+
+    Corners are combined axis by axis: along z, then y, then x. A brick's last cells take their far corners
+    from the first layer of the next brick.
+
+    >>> nine = packed_bits(np.ones((8, 8, 8, 8), bool))
+    >>> coords = np.argwhere(np.ones((2, 2, 2))).astype(np.uint16)
+    >>> found = live_cells(Bricks(coords, nine))
+    >>> found.coords[0].tolist(), np.bitwise_count(found.masks).sum(axis=1).tolist()
+    ([0, 0, 0], [512, 448, 448, 392, 448, 392, 392, 343])
+    >>> bool((corners_of(found).masks == nine).all())
+    True
+    """
+    coords, masks = vertices.coords, vertices.masks
+
+    def beyond(masks: np.ndarray, *offset: int) -> np.ndarray:
+        return Bricks(coords, masks).masks_at(coords.astype(np.int64) + offset)
+
+    along_z = ((masks >> _ONE) & ~_Z_LAST) | ((beyond(masks, 0, 0, 1) & _Z_FIRST) << _SEVEN)
+    live = masks & along_z
+    live = live & ((live >> _EIGHT) | (beyond(live, 0, 1, 0) << _FIFTY_SIX))
+    live = live & np.concatenate([live[:, 1:], beyond(live, 1, 0, 0)[:, :1]], axis=1)
+    return Bricks(coords, live).without_empty()
 
 
 def _neighbourhood(coords: np.ndarray, low: int, high: int) -> np.ndarray:

@@ -11,8 +11,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from player.asset.bricks import bricks_per_axis, corner_masks, dense_index, live_cells, stored_bits
-from player.asset.pyramid import Bricks, Pyramid, PyramidValues, Vertices
+from player.asset.bricks import stored_bits
+from player.asset.pyramid import Bricks, Pyramid, PyramidValues, live_cells
 
 
 class VertexBricks(NamedTuple):
@@ -41,14 +41,10 @@ def from_vertices(stored: VertexBricks, resolution: int) -> PyramidValues:
     >>> int(stored_bits(found.pyramid.levels[0].masks).sum()), found.values[0][:, 0].tolist()
     (1, [0, 1, 2, 3, 4, 5, 6, 7])
     """
-    coords, masks = np.asarray(stored.coords), np.asarray(stored.masks, np.uint64)
+    masks = np.asarray(stored.masks, np.uint64)
     values = stored.values[:, None] if stored.values.ndim == 1 else stored.values
-    index = dense_index(coords, bricks_per_axis(resolution))
-    live = live_cells(coords, masks, index)
-    pyramid = Pyramid(resolution, (Bricks(coords, live).without_empty(),))
-    kept = corner_masks(coords, live, index)
-    vertices = Bricks(coords, kept).without_empty()
-    vars(pyramid)["vertices"] = (Vertices(vertices, np.zeros_like(vertices.masks)),)  # already known
+    pyramid = Pyramid(resolution, (live_cells(Bricks(np.asarray(stored.coords), masks)),))
+    kept = pyramid.vertices[0].bricks.masks_at(stored.coords)
     if not np.array_equal(kept, masks):
         values = values[stored_bits(kept)[stored_bits(masks)]]
     return PyramidValues(pyramid, (values,))

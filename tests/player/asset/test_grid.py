@@ -9,16 +9,10 @@ import numpy as np
 import pytest
 
 from player.asset.asset import Asset
-from player.asset.bricks import (
-    bricks_per_axis,
-    dense_index,
-    live_cells,
-    pack_vertices,
-    unpack_vertices,
-)
+from player.asset.bricks import bricks_per_axis, pack_vertices, unpack_vertices
 from player.asset.density import decode_density, encode_density
 from player.asset.grid import MAX_DISTANCE, build_grid
-from player.asset.pyramid import Pyramid
+from player.asset.pyramid import Bricks, Pyramid, live_cells
 from player.asset.single_level import VertexBricks, from_vertices
 from player.march.fetches import stored_features
 from tests.numerics.bounds import Row
@@ -63,9 +57,9 @@ def test_packing_round_trip_and_live_cells(resolution: int, share: float) -> Non
     keys = [tuple(c) for c in coords.tolist()]
     assert keys == sorted(set(keys))
     n = bricks_per_axis(resolution)
-    live = live_cells(coords, masks, dense_index(coords, n))
+    live = live_cells(Bricks(coords, masks))
     found = np.zeros((n * 8,) * 3, bool)
-    found[tuple(unpack_vertices(coords, live).T)] = True
+    found[tuple(unpack_vertices(live.coords, live.masks).T)] = True
     expected = np.ones((resolution,) * 3, bool)
     for i, j, k in np.ndindex(2, 2, 2):
         expected &= dense[i : i + resolution, j : j + resolution, k : k + resolution]
@@ -91,9 +85,9 @@ def test_one_missing_corner_kills_eight_cells() -> None:
     dense = np.ones((21, 21, 21), bool)
     dense[8, 8, 8] = False
     coords, masks, _ = pack_vertices(np.argwhere(dense))
-    live = live_cells(coords, masks, dense_index(coords, 3))
+    live = live_cells(Bricks(coords, masks))
     dead = set(map(tuple, np.argwhere(np.ones((20,) * 3)).tolist()))
-    dead -= set(map(tuple, unpack_vertices(coords, live).tolist()))
+    dead -= set(map(tuple, unpack_vertices(live.coords, live.masks).tolist()))
     assert dead == {(7 + i, 7 + j, 7 + k) for i, j, k in np.ndindex(2, 2, 2)}
 
 
