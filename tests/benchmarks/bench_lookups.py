@@ -18,6 +18,7 @@ import numpy as np
 from player.asset.asset import Asset
 from player.render import Renderer
 from tests.benchmarks.bench_specks import test_views
+from vfr_bake.data.scene import evenly
 from vfr_bake.training.scores.metrics import psnr
 
 
@@ -25,7 +26,7 @@ def view_scores(folder: Path, data: Path, n_views: int, samples: list[int]) -> d
     """Return the PSNR in dB of every view, by the number of lookups; views are spread evenly."""
     asset = Asset.open(folder)
     cameras, photographs = test_views(asset, data)
-    chosen = np.linspace(0, len(cameras) - 1, min(n_views, len(cameras))).round().astype(int)
+    chosen = evenly(len(cameras), n_views)
     with Renderer(asset) as renderer:
         return {
             str(k): [
