@@ -15,7 +15,7 @@ from player.asset.asset import Asset
 from player.asset.manifest import Manifest, file_entry, manifest_bytes
 from player.asset.pyramid import PyramidValues
 from player.asset.single_level import VertexBricks
-from player.asset.version_3.unpacking import DENSITIES, FEATURES, PLACES
+from player.asset.version_3.unpacking import DENSITIES, FEATURES
 
 KEYS_OF_4 = ("level_steps", "density_steps", "feature_steps", "parts")
 STRATEGIES = (zlib.Z_HUFFMAN_ONLY, zlib.Z_DEFAULT_STRATEGY)
@@ -61,7 +61,7 @@ def write_version_3(
         coords = io.BytesIO()
         np.save(coords, np.ascontiguousarray(stored.coords, "<u2"))
         packed = coords.getvalue(), pack_masks(stored.masks), pack_codes(stored.values)
-        files = files | {PLACES[name]: data for name, data in zip(names, packed, strict=True)}
+        files = files | dict(zip(names, packed, strict=True))
     for name, data in files.items():
         (folder / name).write_bytes(data)
     (folder / "manifest.json").write_bytes(manifest_3(manifest, files))

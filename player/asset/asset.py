@@ -29,8 +29,9 @@ from player.asset.manifest import (
 from player.asset.parts import DTYPES, PartsReader
 from player.asset.pyramid import PyramidValues
 from player.asset.sections import MAX_ROWS, Grid
+from player.asset.single_level import from_vertices
 from player.asset.target import check_asset_target
-from player.asset.version_3.unpacking import read_version_3
+from player.asset.version_3.unpacking import read_arrays
 from player.errors import ConfigError, FormatError
 from player.files.files import new_folder, read_bytes
 from player.files.memory import allowed_bytes
@@ -244,7 +245,12 @@ class _Opening:
         """Return the asset made of its first `n_parts` parts, or of fewer if a later one cannot be read."""
         folder, manifest, parts = self._folder, self.manifest, self._parts
         if manifest.version < (4, 0):
-            return Asset(folder, manifest, GridArrays(*read_version_3(folder, manifest, self._allowed)))
+            densities, features = read_arrays(folder, manifest, self._allowed)
+            arrays = GridArrays(
+                from_vertices(densities, manifest.resolution),
+                from_vertices(features, manifest.feature_resolution),
+            )
+            return Asset(folder, manifest, arrays)
         missing = None
         try:
             parts.read(n_parts)

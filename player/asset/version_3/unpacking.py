@@ -9,6 +9,7 @@ of the grid to build. No more than that is ever unpacked, whatever a file holds.
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -18,26 +19,16 @@ from player.asset.bricks import bricks_per_axis, with_corners
 from player.asset.check_bricks import check_inside, check_sorted
 from player.asset.manifest import Manifest
 from player.asset.parts import Counts, grid_bytes
-from player.asset.pyramid import Bricks, PyramidValues
-from player.asset.single_level import VertexBricks, from_vertices
+from player.asset.pyramid import Bricks
+from player.asset.single_level import VertexBricks
 from player.asset.version_3.packing import unpack_codes, unpack_masks
 from player.errors import FormatError
 from player.files.files import read_bytes
 from player.files.memory import check_memory
 
-PLACES = {
-    "brick_coords": "brick_coords.npy",
-    "brick_masks": "brick_masks.bits",
-    "density": "density.codes",
-    "feature_coords": "feature_coords.npy",
-    "feature_masks": "feature_masks.bits",
-    "features": "features.codes",
-}
-"""The file of each array."""
-
-Names = tuple[str, str, str]
-DENSITIES: Names = ("brick_coords", "brick_masks", "density")
-FEATURES: Names = ("feature_coords", "feature_masks", "features")
+DENSITIES = ("brick_coords.npy", "brick_masks.bits", "density.codes")
+FEATURES = ("feature_coords.npy", "feature_masks.bits", "features.codes")
+"""The files of each grid: the coordinates of its bricks, their masks, and the codes."""
 
 _HEADER = re.compile(
     rb"\x93NUMPY\x01\x00(..)"
@@ -57,53 +48,63 @@ def needed_bytes(n_packed: int, densities: Counts, features: Counts) -> int:
     return 70 * n_bricks + n_codes + max(unpacking, grid_bytes(densities, features))
 
 
-def _least(n_per_axis: int, n_bricks: int) -> Counts:
-    """Return the counts of a grid of which only the number of bricks is known."""
-    return Counts(n_per_axis, n_bricks, n_bricks, n_vertices=0, n_channels=0)
-
-
-def _check_coords_files(folder: Path, manifest: Manifest, allowed: int) -> None:
-    """Check the sizes of the files of coordinates before they are read.
-
-    Raises FormatError: more bricks than a grid can have. ConfigError: the bricks take more memory than is
-    allowed.
-    """
-    for names, n_per_axis in _per_axis(manifest):
-        name, most = PLACES[names[0]], 6 * n_per_axis**3 + _LONGEST_HEADER
-        if manifest.files[name].bytes > most:
-            raise FormatError(
-                f"{folder / name}: size: expected at most {most} bytes, got {manifest.files[name].bytes}"
-            )
-    least = [_least(n, _n_bricks(manifest, names)) for names, n in _per_axis(manifest)]
-    check_memory(needed_bytes(0, *least), allowed, str(folder))
-
-
-def _per_axis(manifest: Manifest) -> list[tuple[Names, int]]:
-    return [
-        (DENSITIES, bricks_per_axis(manifest.resolution)),
-        (FEATURES, bricks_per_axis(manifest.feature_resolution)),
-    ]
-
-
-def _n_bricks(manifest: Manifest, names: Names) -> int:
-    """Return the least number of bricks that a grid can have, by the size of the file of coordinates."""
-    return max(manifest.files[PLACES[names[0]]].bytes - _LONGEST_HEADER, 0) // 6
-
-
 def _most_packed(n_bytes: int) -> int:
     """Return a bound on the size of a zlib stream of `n_bytes`. Data that cannot be compressed takes about a
     thousandth more than its own size, and a few bytes take relatively more."""
     return n_bytes + n_bytes // 100 + 1000
 
 
-def read_version_3(folder: Path, manifest: Manifest, allowed: int) -> tuple[PyramidValues, PyramidValues]:
-    """Read the densities and the features of an asset of version 3 as pyramids of one level. Arguments and
-    errors are those of `read_arrays`."""
-    densities, features = read_arrays(folder, manifest, allowed)
-    return (
-        from_vertices(densities, manifest.resolution),
-        from_vertices(features, manifest.feature_resolution),
-    )
+class _Files:
+    """The files of one of the two grids, which are read one after another. Each step returns as much as is
+    then known of the grid's sizes."""
+
+    def __init__(self, folder: Path, manifest: Manifest, names: tuple[str, str, str]) -> None:
+        self._coords_path, self._masks_path, self._codes_path = (folder / name for name in names)
+        self._n_bytes = manifest.files[names[0]].bytes
+        self._of_features = names is FEATURES
+        self._resolution = manifest.feature_resolution if self._of_features else manifest.resolution
+        self._n_per_axis = bricks_per_axis(self._resolution)
+        self._n_channels = manifest.n_channels if self._of_features else 1
+
+    def check_size(self) -> Counts:
+        """Raise FormatError if the file of coordinates is larger than that of any grid."""
+        most = 6 * self._n_per_axis**3 + _LONGEST_HEADER
+        if self._n_bytes > most:
+            raise FormatError(
+                f"{self._coords_path}: size: expected at most {most} bytes, got {self._n_bytes}"
+            )
+        return self._least(max(self._n_bytes - _LONGEST_HEADER, 0) // 6)
+
+    def read_coords(self) -> Counts:
+        self._coords = read_coords(_read(self._coords_path, self._n_bytes), str(self._coords_path))
+        return self._least(len(self._coords))
+
+    def _least(self, n_bricks: int) -> Counts:
+        return Counts(self._n_per_axis, n_bricks, n_bricks, n_vertices=0, n_channels=0)
+
+    def read_masks(self) -> Counts:
+        coords, n = self._coords, len(self._coords)
+        self._masks = masks = unpack_masks(
+            _read(self._masks_path, _most_packed(64 * n)), n, str(self._masks_path)
+        )
+        check_sorted(coords, str(self._coords_path))
+        check_inside(Bricks(coords, masks), self._resolution + 1, "vertices", str(self._coords_path))
+        if self._of_features and not masks.any():  # every sample with weight needs a feature
+            raise FormatError(f"{self._masks_path}: expected at least one stored vertex, got none")
+        self._n_vertices = int(np.bitwise_count(masks).sum(dtype=np.int64))
+        n_held = len(with_corners(coords, masks, self._n_per_axis)) if self._of_features else 0
+        return Counts(self._n_per_axis, n, n, self._n_vertices, self._n_channels, n_held)
+
+    def read_codes(self) -> VertexBricks:
+        n, n_channels = self._n_vertices, self._n_channels
+        data = _read(self._codes_path, _most_packed(n * n_channels))
+        shape, dtype = ((n, n_channels), "i1") if self._of_features else ((n,), "u1")
+        codes = unpack_codes(data, shape, dtype, str(self._codes_path))
+        return VertexBricks(self._coords, self._masks, codes)
+
+
+def _read(path: Path, most: int) -> bytes:
+    return read_bytes(path, "an array", most, path.parent)
 
 
 def read_arrays(folder: Path, manifest: Manifest, allowed: int) -> tuple[VertexBricks, VertexBricks]:
@@ -114,49 +115,18 @@ def read_arrays(folder: Path, manifest: Manifest, allowed: int) -> tuple[VertexB
 
     Raises FormatError: the files break the format. ConfigError: they take more memory than is allowed.
     """
+    grids = [_Files(folder, manifest, names) for names in (DENSITIES, FEATURES)]
 
-    _check_coords_files(folder, manifest, allowed)
+    def check(n_packed: int, counts: Iterable[Counts]) -> None:
+        check_memory(needed_bytes(n_packed, *counts), allowed, str(folder))
 
-    def read(name: str, most: int) -> bytes:
-        return read_bytes(folder / PLACES[name], "an array", most, folder)
-
-    def masks(names: Names, coords: np.ndarray, n_per_axis: int) -> tuple[np.ndarray, Counts]:
-        found = unpack_masks(
-            read(names[1], _most_packed(64 * len(coords))), len(coords), str(folder / PLACES[names[1]])
-        )
-        of_features = names is FEATURES
-        resolution = manifest.feature_resolution if of_features else manifest.resolution
-        check_sorted(coords, str(folder / PLACES[names[0]]))
-        check_inside(Bricks(coords, found), resolution + 1, "vertices", str(folder / PLACES[names[0]]))
-        if of_features and not found.any():  # every sample with weight needs a feature
-            raise FormatError(f"{folder / PLACES[names[1]]}: expected at least one stored vertex, got none")
-        n_vertices = int(np.bitwise_count(found).sum(dtype=np.int64))
-        n_held = len(with_corners(coords, found, n_per_axis)) if of_features else 0
-        n_channels = manifest.n_channels if of_features else 1
-        return found, Counts(n_per_axis, len(coords), len(coords), n_vertices, n_channels, n_held)
-
-    def codes(names: Names, counts: Counts) -> np.ndarray:
-        of_features = names is FEATURES
-        shape = (counts.n_vertices, counts.n_channels) if of_features else (counts.n_vertices,)
-        data = read(names[2], _most_packed(counts.n_vertices * counts.n_channels))
-        return unpack_codes(data, shape, "i1" if of_features else "u1", str(folder / PLACES[names[2]]))
-
-    (_, n_dense), (_, n_coarse) = _per_axis(manifest)
-    coords, coarse = (
-        read_coords(read(names[0], manifest.files[PLACES[names[0]]].bytes), str(folder / PLACES[names[0]]))
-        for names in (DENSITIES, FEATURES)
-    )
-    n_packed = sum(manifest.files[name].bytes for name in PLACES.values())
-    least = needed_bytes(n_packed, _least(n_dense, len(coords)), _least(n_coarse, len(coarse)))
-    check_memory(least, allowed, str(folder))
-    with ThreadPoolExecutor(1) as other:  # both grids at the same time: unpacking releases the GIL
-        later = other.submit(masks, FEATURES, coarse, n_coarse)
-        found, dense_counts = masks(DENSITIES, coords, n_dense)
-        coarse_found, coarse_counts = later.result()
-        check_memory(needed_bytes(n_packed, dense_counts, coarse_counts), allowed, str(folder))
-        features = other.submit(codes, FEATURES, coarse_counts)
-        density = codes(DENSITIES, dense_counts)
-        return VertexBricks(coords, found, density), VertexBricks(coarse, coarse_found, features.result())
+    check(0, [grid.check_size() for grid in grids])
+    n_packed = sum(manifest.files[name].bytes for name in (*DENSITIES, *FEATURES))
+    check(n_packed, [grid.read_coords() for grid in grids])
+    with ThreadPoolExecutor(len(grids)) as both:  # at the same time: unpacking releases the GIL
+        check(n_packed, both.map(_Files.read_masks, grids))
+        densities, features = both.map(_Files.read_codes, grids)
+    return densities, features
 
 
 def read_coords(data: bytes, where: str) -> np.ndarray:

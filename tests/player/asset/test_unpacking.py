@@ -15,7 +15,7 @@ from player.asset.bricks import bricks_per_axis, pack_vertices, with_corners
 from player.asset.manifest import Manifest, parse_manifest
 from player.asset.parts import Counts
 from player.asset.single_level import VertexBricks
-from player.asset.version_3.unpacking import PLACES, needed_bytes, read_arrays
+from player.asset.version_3.unpacking import DENSITIES, FEATURES, needed_bytes, read_arrays
 from player.errors import ConfigError, FormatError
 from player.files.memory import _group_limits, allowed_bytes
 from tests.player.conftest import cameras_bytes, head_bytes
@@ -71,7 +71,7 @@ def test_what_is_needed_is_what_is_taken(name: str, tmp_path: Path) -> None:
         held = len(with_corners(coords, masks, n))
         n_channels = codes.size // len(codes)
         counts.append(Counts(n, len(coords), len(coords), len(codes), n_channels, held))
-    n_packed = sum(m.files[file].bytes for file in PLACES.values())
+    n_packed = sum(m.files[file].bytes for file in (*DENSITIES, *FEATURES))
     needed = needed_bytes(n_packed, *counts)
     del arrays, coords, masks, codes
     tracemalloc.start()

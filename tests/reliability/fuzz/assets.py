@@ -27,7 +27,7 @@ from player.asset.asset import Asset, read_manifest
 from player.asset.bricks import bricks_per_axis, pack_vertices
 from player.asset.manifest import parse_manifest
 from player.asset.single_level import VertexBricks
-from player.asset.version_3.unpacking import PLACES, read_arrays
+from player.asset.version_3.unpacking import DENSITIES, FEATURES, read_arrays
 from player.compiling import available
 from player.errors import FormatError
 from player.render import March, Renderer
@@ -35,6 +35,8 @@ from tests.reliability.fuzz.broken import broken_bytes, broken_json, broken_valu
 from tests.reliability.fuzz.targets import Target, small_view
 from tests.version_3 import pack_codes, pack_masks, write_version_3
 
+PLACES = {name.partition(".")[0]: name for name in (*DENSITIES, *FEATURES)}
+"""The files of the arrays of an asset of version 3, by the names that its targets have."""
 Arrays = dict[str, np.ndarray]
 RESOLUTION = 19
 """Cells per axis of the asset that is broken: three bricks, of which the last is not full."""
