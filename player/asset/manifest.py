@@ -1,45 +1,7 @@
-"""Parse and write the manifest of the format `vfr-asset`, version 4.0. docs/format.md specifies the format.
+"""Parse and write the manifest of the format `vfr-asset`, version 4.0.
 
-An asset is a folder of regular files. It holds no absolute path and plays wherever it is moved.
-
-| file | content |
-|---|---|
-| `manifest.json` | the keys below; UTF-8, keys sorted, each once; at most 16 MiB, 2^20 values, 64 deep |
-| `part_0.bin`, `part_1.bin`, ... | densities and features; the first is a whole, coarse picture |
-| `head.onnx` | the graph of `player.head.graph`: `features`, `dirs` -> `rgb`; no other graph is taken |
-| `mesh.ply` | the surface with vertex colours, world frame; an asset plays without it |
-| `cameras.json` | the training cameras as transforms.json with sizes, world frame |
-| `report.json`, `report.html` | the bake's measurements, for people; no player reads them; may be absent |
-
-| key | type | meaning |
-|---|---|---|
-| `format` | "vfr-asset" | |
-| `version` | [major, minor] | [4, 0]; unknown keys of a newer minor are ignored |
-| `generator` | text | the program that wrote the asset |
-| `resolution` | integer, 1..2048 | cells per axis of the densities' finest level |
-| `feature_resolution` | integer, 1..2048 | cells per axis of the features' finest level |
-| `aabb` | 2 x 3 numbers | box, model frame; no farther from the origin than 1000 of its edges |
-| `world_from_model` | 4 x 4 numbers | similarity: rotation, one positive scale, translation |
-| `contracted` | true or false | whether the box is all of space, contracted (`player.march.contraction`) |
-| `near` | number, 0..1e6 | distance at which rays begin, model units; 0 unless contracted |
-| `step` | number > 0 | base step: model units, contracted radians; at most 65536 along the diagonal |
-| `level_steps` | 1 to 8 integers, 1..128 | most base steps of a sample on each density level, powers of two |
-| `n_fetches` | integer, 0..1024 | feature lookups a ray; 0 means one at every sample |
-| `density_range` | 2 numbers, -80..80 | log sigma at codes 0 and 255 |
-| `density_steps` | 1 to 8 integers, 1..255 | quantization step of the density codes on each level |
-| `n_channels` | integer, 1..1024 | feature channels |
-| `feature_steps` | 1 to 8 integers, 1..255 | quantization step of the feature codes on each level |
-| `agreement` | 2 numbers, 0..255 | tolerance for `high`, `fast`; [20, 40], contracted [14, 28], if absent |
-| `quality_fetches` | 2 integers, 0..1024 | most lookups a ray in `high`, `fast`; 0 or absent: `n_fetches` |
-| `background` | 3 numbers, 0..1 | colour behind the scene: white, or the mean of unbounded surroundings |
-| `colour_space` | "srgb" | |
-| `view_size` | 2 integers | width and height of the training pictures |
-| `parts` | list | {`file`, `sections`} of each part (`player.asset.sections`) |
-| `files` | object | name: {`bytes`: integer, `sha256`: 64 hexadecimal digits}, every file but the manifest |
-| `provenance` | object | settings and measured figures, free form |
-
-All numbers are finite. File names are plain: letters, digits, `_`, `-`, `.`, not starting with a dot. A
-manifest of version 3.x calls `n_fetches` `n_samples`, and has no levels and no parts.
+docs/format.md specifies the format, with the type, the bounds and the meaning of every key. A manifest of
+version 3.x calls `n_fetches` `n_samples`, and has no levels and no parts.
 """
 
 from __future__ import annotations
@@ -54,7 +16,16 @@ from functools import partial
 from typing import Any
 
 from player.asset.pyramid import MAX_LEVELS
-from player.asset.sections import MAX_CHANNELS, Grid, Part, in_order, parse_parts, part_name, parts_as_json
+from player.asset.sections import (
+    MAX_CHANNELS,
+    Grid,
+    Part,
+    in_order,
+    parse_parts,
+    part_name,
+    parts_as_json,
+    shown,
+)
 from player.errors import FormatError, VersionError
 
 FORMAT = "vfr-asset"
@@ -93,6 +64,8 @@ OPTIONAL = frozenset({"quality_fetches"})
 CONTRACTED_AABB = ((-2.0, -2.0, -2.0), (2.0, 2.0, 2.0))
 
 Vector = tuple[float, ...]
+Parser = Callable[[str, Any], Any]
+"""A function from the name of a key, for messages, and the JSON there to the value; raises FormatError."""
 
 
 @dataclass(frozen=True)
@@ -114,7 +87,7 @@ def file_entry(data: bytes) -> FileEntry:
 
 @dataclass(frozen=True, kw_only=True)
 class Manifest:
-    """A manifest, whose fields are the keys above. The bake and `parse_manifest` build it; its values are
+    """A manifest, whose fields are its keys. The bake and `parse_manifest` build it; its values are
     checked in either case.
 
     >>> manifest = Manifest(generator="doctest", resolution=8, feature_resolution=4, step=0.2,
@@ -207,7 +180,7 @@ def parse_manifest(data: bytes, where: str) -> Manifest:
             f"{where}: expected at most {MAX_DEPTH} lists and objects inside one another, got more"
         )
     if not isinstance(document, dict) or document.get("format") != FORMAT:
-        raise FormatError(f'{where}: format: expected "{FORMAT}", got {_show(document)}')
+        raise FormatError(f'{where}: format: expected "{FORMAT}", got {shown(document)}')
     version = _parse_version(f"{where}: version", document.get("version"))
     if version < (4, 0):
         document = _of_version_4(document, version)
@@ -221,9 +194,7 @@ def parse_manifest(data: bytes, where: str) -> Manifest:
         raise FormatError(
             f"{where}: {ascii(unknown[0])[1:-1][:80]}: expected no such key in version {list(version)}"
         )
-    parsers: dict[str, Callable[[str, Any], Any]] = _PARSERS | {
-        "parts": partial(parse_parts, newer=version > VERSION)
-    }
+    parsers: dict[str, Parser] = _PARSERS | {"parts": partial(parse_parts, newer=version > VERSION)}
     values = {key: parsers[key](f"{where}: {key}", document[key]) for key in known & set(document)}
     _check_files(f"{where}: files", version, values["files"], values["parts"])
     return Manifest(**values)
@@ -298,11 +269,6 @@ def _finite(text: str) -> float:
     return value if math.isfinite(value) else _refuse(text)
 
 
-def _show(value: object) -> str:
-    text = repr(value)
-    return text if len(text) < 80 else text[:77] + "..."
-
-
 def _parse_version(where: str, value: object) -> tuple[int, ...]:
     version = _integers(2, 0, 1 << 20)(where, value)
     if version[0] not in (3, VERSION[0]):
@@ -313,79 +279,73 @@ def _parse_version(where: str, value: object) -> tuple[int, ...]:
     return version
 
 
-def _text(where: str, value: object) -> str:
-    if not isinstance(value, str):
-        raise FormatError(f"{where}: expected text, got {_show(value)}")
-    return value
+def _of_type(kind: type, expected: str) -> Parser:
+    def parse(where: str, value: object) -> Any:
+        if not isinstance(value, kind):
+            raise FormatError(f"{where}: expected {expected}, got {shown(value)}")
+        return value
+
+    return parse
 
 
-def _boolean(where: str, value: object) -> bool:
-    if not isinstance(value, bool):
-        raise FormatError(f"{where}: expected true or false, got {_show(value)}")
-    return value
+_text, _object = _of_type(str, "text"), _of_type(dict, "an object")
 
 
-def _one_of(*allowed: str) -> Callable[[str, object], str]:
+def _one_of(*allowed: str) -> Parser:
     def parse(where: str, value: object) -> str:
         if value not in allowed:
-            raise FormatError(f"{where}: expected one of {list(allowed)}, got {_show(value)}")
+            raise FormatError(f"{where}: expected one of {list(allowed)}, got {shown(value)}")
         return str(value)
 
     return parse
 
 
-def _integer(low: int, high: int) -> Callable[[str, object], int]:
+def _integer(low: int, high: int) -> Parser:
     def parse(where: str, value: object) -> int:
         if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
-            raise FormatError(f"{where}: expected an integer in {low}..{high}, got {_show(value)}")
+            raise FormatError(f"{where}: expected an integer in {low}..{high}, got {shown(value)}")
         return int(value)
 
     return parse
 
 
-def _integers(count: int, low: int, high: int) -> Callable[[str, object], tuple[int, ...]]:
-    def parse(where: str, value: object) -> tuple[int, ...]:
-        if not isinstance(value, list | tuple) or len(value) != count:
-            raise FormatError(f"{where}: expected {count} integers, got {_show(value)}")
-        return tuple(_integer(low, high)(where, item) for item in value)
-
-    return parse
-
-
-def _steps_of_levels(most: int) -> Callable[[str, object], tuple[int, ...]]:
-    def parse(where: str, value: object) -> tuple[int, ...]:
-        if not isinstance(value, list | tuple) or not 1 <= len(value) <= MAX_LEVELS:
-            raise FormatError(f"{where}: expected 1 to {MAX_LEVELS} integers, got {_show(value)}")
-        return tuple(_integer(1, most)(where, item) for item in value)
-
-    return parse
-
-
-def _number(low: float, high: float) -> Callable[[str, object], float]:
+def _number(low: float, high: float) -> Parser:
     def parse(where: str, value: object) -> float:
         if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
-            raise FormatError(f"{where}: expected a number in {low:g}..{high:g}, got {_show(value)}")
+            raise FormatError(f"{where}: expected a number in {low:g}..{high:g}, got {shown(value)}")
         return float(value)
 
     return parse
 
 
-def _numbers(count: int, low: float = -1e9, high: float = 1e9) -> Callable[[str, object], Vector]:
-    def parse(where: str, value: object) -> Vector:
-        if not isinstance(value, list | tuple) or len(value) != count:
-            raise FormatError(f"{where}: expected {count} numbers, got {_show(value)}")
-        return tuple(_number(low, high)(where, item) for item in value)
+def _list(of: str, item: Parser, least: int, most: int | None = None) -> Parser:
+    """Make the parser of a list of `least` to `most` items, or exactly `least`; messages call it by their
+    number and `of`."""
+    most = most or least
+    expected = f"{least} {of}" if most == least else f"{least} to {most} {of}"
+
+    def parse(where: str, value: object) -> tuple[Any, ...]:
+        if not isinstance(value, list | tuple) or not least <= len(value) <= most:
+            raise FormatError(f"{where}: expected {expected}, got {shown(value)}")
+        return tuple(item(where, each) for each in value)
 
     return parse
 
 
-def _matrix(rows: int, columns: int) -> Callable[[str, object], tuple[Vector, ...]]:
-    def parse(where: str, value: object) -> tuple[Vector, ...]:
-        if not isinstance(value, list | tuple) or len(value) != rows:
-            raise FormatError(f"{where}: expected {rows} rows of {columns} numbers, got {_show(value)}")
-        return tuple(_numbers(columns)(where, row) for row in value)
+def _integers(count: int, low: int, high: int) -> Parser:
+    return _list("integers", _integer(low, high), count)
 
-    return parse
+
+def _steps_of_levels(most: int) -> Parser:
+    return _list("integers", _integer(1, most), 1, MAX_LEVELS)
+
+
+def _numbers(count: int, low: float = -1e9, high: float = 1e9) -> Parser:
+    return _list("numbers", _number(low, high), count)
+
+
+def _matrix(rows: int, columns: int) -> Parser:
+    return _list(f"rows of {columns} numbers", _numbers(columns), rows)
 
 
 def _similarity(where: str, value: object) -> tuple[Vector, ...]:
@@ -403,37 +363,29 @@ def _similarity(where: str, value: object) -> tuple[Vector, ...]:
         and matrix[3] == (0, 0, 0, 1)
     )
     if not is_similarity:
-        raise FormatError(f"{where}: expected a rotation, one scale and a translation, got {_show(value)}")
+        raise FormatError(f"{where}: expected a rotation, one scale and a translation, got {shown(value)}")
     return matrix
 
 
 def _files(where: str, value: object) -> dict[str, FileEntry]:
-    if not isinstance(value, dict):
-        raise FormatError(f"{where}: expected an object, got {_show(value)}")
     entries = {}
-    for name, entry in value.items():
+    for name, entry in _object(where, value).items():
         if (
             not isinstance(name, str)
             or not re.fullmatch(r"[A-Za-z0-9_-][A-Za-z0-9_.-]{0,199}", name)
             or name == NAME
         ):
-            raise FormatError(f"{where}: expected plain file names, got {_show(name)}")
+            raise FormatError(f"{where}: expected plain file names, got {shown(name)}")
         if isinstance(entry, FileEntry):
             entry = {"bytes": entry.bytes, "sha256": entry.sha256}
         if not isinstance(entry, dict) or not {"bytes", "sha256"} <= set(entry):
-            raise FormatError(f"{where}: {name}: expected bytes and sha256, got {_show(entry)}")
+            raise FormatError(f"{where}: {name}: expected bytes and sha256, got {shown(entry)}")
         size = _integer(0, 1 << 50)(f"{where}: {name}: bytes", entry["bytes"])
         digest = _text(f"{where}: {name}: sha256", entry["sha256"])
         if not re.fullmatch(r"[0-9a-f]{64}", digest):
-            raise FormatError(f"{where}: {name}: sha256: expected 64 hexadecimal digits, got {_show(digest)}")
+            raise FormatError(f"{where}: {name}: sha256: expected 64 hexadecimal digits, got {shown(digest)}")
         entries[name] = FileEntry(size, digest)
     return entries
-
-
-def _object(where: str, value: object) -> dict[str, Any]:
-    if not isinstance(value, dict):
-        raise FormatError(f"{where}: expected an object, got {_show(value)}")
-    return value
 
 
 def _check_together(manifest: Manifest) -> None:
@@ -473,7 +425,7 @@ def _check_together(manifest: Manifest) -> None:
     next(manifest.parts_in_order(), None)  # without the first part there is no picture
 
 
-_PARSERS: dict[str, Callable[[str, Any], Any]] = {
+_PARSERS: dict[str, Parser] = {
     "version": _parse_version,
     "generator": _text,
     "resolution": _integer(1, MAX_RESOLUTION),
@@ -481,7 +433,7 @@ _PARSERS: dict[str, Callable[[str, Any], Any]] = {
     "aabb": _matrix(2, 3),
     "world_from_model": _similarity,
     "step": _number(1e-9, 1e9),
-    "contracted": _boolean,
+    "contracted": _of_type(bool, "true or false"),
     "near": _number(0, 1e6),
     "level_steps": _steps_of_levels(MAX_LEVEL_STEP),
     "n_fetches": _integer(0, 1024),

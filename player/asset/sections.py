@@ -110,7 +110,7 @@ def parse_parts(where: str, value: object, newer: bool = False) -> tuple[Part, .
     if isinstance(value, tuple) and all(isinstance(part, Part) for part in value):
         value = parts_as_json(value)
     if not isinstance(value, list) or len(value) > MAX_PARTS:
-        raise FormatError(f"{where}: expected a list of at most {MAX_PARTS} parts, got {_show(value)}")
+        raise FormatError(f"{where}: expected a list of at most {MAX_PARTS} parts, got {shown(value)}")
     parts = tuple(_parse_part(f"{where}: {number}", number, part, newer) for number, part in enumerate(value))
     n_sections = sum(len(part.sections) for part in parts)
     if n_sections > MAX_SECTIONS:
@@ -120,12 +120,12 @@ def parse_parts(where: str, value: object, newer: bool = False) -> tuple[Part, .
 
 def _parse_part(where: str, number: int, value: object, newer: bool) -> Part:
     if not isinstance(value, dict) or not _has_keys(value, {"file", "sections"}, newer):
-        raise FormatError(f"{where}: expected an object with file and sections, got {_show(value)}")
+        raise FormatError(f"{where}: expected an object with file and sections, got {shown(value)}")
     if value["file"] not in PART_NAMES:
-        raise FormatError(f"{where}: file: expected {part_name(number)}, got {_show(value['file'])}")
+        raise FormatError(f"{where}: file: expected {part_name(number)}, got {shown(value['file'])}")
     sections = value["sections"]
     if not isinstance(sections, list) or not 1 <= len(sections) <= MAX_SECTIONS:
-        raise FormatError(f"{where}: sections: expected a list of 1 to {MAX_SECTIONS}, got {_show(sections)}")
+        raise FormatError(f"{where}: sections: expected a list of 1 to {MAX_SECTIONS}, got {shown(sections)}")
     found = (_parse_section(f"{where}: section {i}", section, newer) for i, section in enumerate(sections))
     return Part(value["file"], tuple(found))
 
@@ -146,16 +146,16 @@ _MOST = {
 
 def _parse_section(where: str, value: object, newer: bool) -> Section:
     if not isinstance(value, dict) or value.get("kind") not in ("structure", "symbols"):
-        raise FormatError(f'{where}: expected an object of kind "structure" or "symbols", got {_show(value)}')
+        raise FormatError(f'{where}: expected an object of kind "structure" or "symbols", got {shown(value)}')
     keys = {*_COMMON, *_OF_KIND[value["kind"]]}
     if not _has_keys(value, keys, newer):
-        raise FormatError(f"{where}: expected the keys {sorted(keys)}, got {_show(sorted(map(str, value)))}")
+        raise FormatError(f"{where}: expected the keys {sorted(keys)}, got {shown(sorted(map(str, value)))}")
     if value["grid"] not in ("densities", "features"):
-        raise FormatError(f'{where}: grid: expected "densities" or "features", got {_show(value["grid"])}')
+        raise FormatError(f'{where}: grid: expected "densities" or "features", got {shown(value["grid"])}')
     for key, most in _MOST.items():
         number = value[key] if key in keys else 0
         if isinstance(number, bool) or not isinstance(number, int) or not 0 <= number <= most:
-            raise FormatError(f"{where}: {key}: expected an integer in 0..{most}, got {_show(number)}")
+            raise FormatError(f"{where}: {key}: expected an integer in 0..{most}, got {shown(number)}")
     return Section(**{key: value[key] for key in keys})
 
 
@@ -241,6 +241,7 @@ def _check_order(section: Section, known: list[int], where: str) -> None:
     known[level] = section.end_channel
 
 
-def _show(value: object) -> str:
+def shown(value: object) -> str:
+    """Return a value as messages show it: short, in ASCII."""
     text = ascii(value)
     return text if len(text) < 80 else text[:77] + "..."
