@@ -253,9 +253,8 @@ def build_grid(
     """
     pyramid = densities.pyramid
     shown = [_shown(pyramid, level) for level in range(len(pyramid.levels))]
-    coords = [bricks.coords for bricks in shown]
+    coords, masks = [bricks.coords for bricks in shown], [bricks.masks for bricks in shown]
     table = _painted(pyramid, coords)
-    masks = [bricks.masks for bricks in shown]
     _add_distances(table, _forget_dead(table, masks, level_steps) if skip_dead else None)
     low, slope = decode_constants(density_range)
     box = np.asarray(aabb, np.float64)
@@ -272,7 +271,7 @@ def build_grid(
         slot_coords=np.concatenate(coords).astype(np.int32),
         slot_levels=np.repeat(np.arange(len(coords), dtype=np.int32), [len(some) for some in coords]),
         table=table.reshape(-1),
-        live=np.concatenate([bricks.masks for bricks in shown]).astype("<u8").view(np.uint8).reshape(-1),
+        live=np.concatenate(masks).astype("<u8").view(np.uint8).reshape(-1),
         density=_with_apron(densities, coords),
         rows=vertex_rows(features.pyramid),
         features=np.ascontiguousarray(values) if len(values) else np.zeros((1, values.shape[1]), np.int8),

@@ -16,7 +16,6 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 
 from player.asset.bricks import bricks_per_axis, with_corners
-from player.asset.coder.lanes import Neighbours
 from player.asset.folder import read_checked
 from player.asset.manifest import NAME, Manifest
 from player.asset.pyramid import NO_BRICKS, Pyramid, PyramidValues, values_of
@@ -32,8 +31,6 @@ T = TypeVar("T")
 LIMITS: dict[Grid, tuple[int, int]] = {"densities": (0, 255), "features": (-127, 127)}
 """The lowest and the highest code of each grid."""
 DTYPES: dict[Grid, type[np.generic]] = {"densities": np.uint8, "features": np.int8}
-
-
 GRIDS: tuple[Grid, Grid] = ("densities", "features")
 MAX_THREADS = 8
 """The most sections that are decoded at a time: each takes memory of its own."""
@@ -90,8 +87,7 @@ class PyramidReader:
         Raises FormatError: the section breaks the format.
         """
         section, data, where = stored
-        own = LevelRows(Neighbours(rows.neighbours.rows), rows.classes)  # Neighbours caches for one section
-        found = decode_level(data, own, section.n_channels, where)
+        found = decode_level(data, rows, section.n_channels, where)
         self._symbols[section.level][:, section.first_channel : section.end_channel] = found
 
     def forget(self, section: Section) -> None:
@@ -167,10 +163,7 @@ class PartsReader:
     def __init__(self, folder: Path, manifest: Manifest, allowed: int) -> None:
         """`allowed`: bytes of memory that may be taken."""
         self._folder, self._manifest, self._allowed = folder, manifest, allowed
-        self._grids: dict[Grid, PyramidReader] = {
-            "densities": PyramidReader("densities", manifest),
-            "features": PyramidReader("features", manifest),
-        }
+        self._grids = {grid: PyramidReader(grid, manifest) for grid in GRIDS}
         self._parts: list[Part] = []
         """The parts that can be decoded one after another."""
         self._not_in_order: FormatError | None = None

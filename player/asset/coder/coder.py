@@ -171,11 +171,11 @@ class Decoder:
             FormatError: not a block of so many rows and channels. Memory is bounded by the number of rows and
                 the length of `data`, plus 2 MB.
         """
-        self._where, self._neighbours, self._n_classes = where, neighbours, n_classes
+        self._where = where
         self._channel, self._n_channels = 0, n_channels
         self._by_row, self._classes = None, np.zeros(0, np.uint8)
         self._at = self._n_beyond = 0
-        n = neighbours.n
+        self._n = n = neighbours.n
         self._empty = not n * n_channels
         if self._empty:
             if data:
@@ -203,11 +203,12 @@ class Decoder:
         if (self._beyond > MAX_SYMBOL - END).any():
             raise FormatError(f"{where}: symbols: expected magnitudes up to {MAX_SYMBOL}, got more")
         self._lanes = RowsToLanes(n, n_lanes)
+        self._near = neighbours.in_order(self._lanes)
 
     def channel(self, classes: np.ndarray) -> np.ndarray:
         """Decode the symbols [n] int16 of the next channel with classes [n] uint8. Raises FormatError."""
         if self._empty:
-            return np.zeros(self._neighbours.n, np.int16)
+            return np.zeros(self._n, np.int16)
         if classes is not self._by_row:
             self._by_row, self._classes = classes, self._lanes.in_order(classes)
         found, self._at = _twin().decode_channel(
@@ -217,7 +218,7 @@ class Decoder:
             self._lookup,
             self._of_context[self._channel],
             self._classes,
-            self._neighbours.in_order(self._lanes),
+            self._near,
         )
         if self._at < 0:
             raise FormatError(f"{self._where}: words: expected more than {self._n_words}")

@@ -7,7 +7,7 @@ known to all lanes at every later step.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -76,7 +76,6 @@ class Neighbours:
     rows: np.ndarray
     """[3, n] int32: the rows of each row's neighbours, -1 for a neighbour that does not exist. In a grid they
     are the next vertices along -z, -y and -x."""
-    _kept: dict[RowsToLanes, np.ndarray] = field(default_factory=dict, repr=False)
 
     @property
     def n(self) -> int:
@@ -84,14 +83,9 @@ class Neighbours:
 
     def in_order(self, lanes: RowsToLanes) -> np.ndarray:
         """Return the neighbours [3, n] uint32 of the rows in the order of coding, n for a neighbour that does
-        not exist. The last result is cached."""
-        found = self._kept.get(lanes)
-        if found is None:
-            found = np.stack([lanes.in_order(rows) for rows in self.rows]).view(np.uint32)
-            np.minimum(found, np.uint32(self.n), out=found)  # -1 is the largest uint32, and becomes n
-            self._kept.clear()
-            self._kept[lanes] = found
-        return found
+        not exist."""
+        found = np.stack([lanes.in_order(rows) for rows in self.rows]).view(np.uint32)
+        return np.minimum(found, np.uint32(self.n), out=found)  # -1 is the largest uint32, and becomes n
 
     def known(self, lanes: RowsToLanes) -> np.ndarray:
         """Return [3, n] int32: each row's neighbours that are coded at an earlier step, n for others."""
