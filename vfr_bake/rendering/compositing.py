@@ -34,8 +34,8 @@ class RaySamples:
     """[n_served] first sample of each of these rays."""
     counts: Tensor
     """[n_served] number of samples of each of these rays, 0 where a ray meets nothing."""
-    sigmas: Tensor | None = None
-    """[n_samples] densities, if the march has looked them up."""
+    sigmas: Tensor
+    """[n_samples] densities that the march looked up."""
     trail: Any = None
     """Values about the samples that the guide of a training needs later in the step, in
     tensors and plain values."""
@@ -59,21 +59,21 @@ def composite(sigmas: Tensor, features: Tensor, deltas: Tensor, starts: Tensor, 
 def composite_field(
     density: DensityNetwork,
     features: Tensor,
-    sigmas: Tensor | None,
+    sigmas: Tensor,
     deltas: Tensor,
     starts: Tensor,
     counts: Tensor,
     faint: float = 0.0,
 ) -> Composite:
-    """Composite as `composite` does, with the densities that `density` has at
+    """Composite as `composite` does, with the densities `sigmas` [n_samples] that `density` has at
     `features`, on a CPU, in float32.
 
-    If a march has already computed `sigmas` [n_samples], these are used. Differentiable with respect to the
-    features and the network; `TruncatedExp` says how a saturated density learns. The gradient with respect to
-    the features of a sample is set to 0 if its length is less than `faint` times the root mean square of all.
+    Differentiable with respect to the features and the network; `TruncatedExp` says how a saturated density
+    learns. The gradient with respect to the features of a sample is set to 0 if its length is less than
+    `faint` times the root mean square of all.
     """
     samples = features, sigmas, deltas, starts, counts
-    return Composite(*_CompositeField.apply(*samples, faint, density, *density.parameters()))  # type: ignore[misc]
+    return Composite(*_CompositeField.apply(*samples, faint, *density.parameters()))  # type: ignore[misc]
 
 
 def distortion(
@@ -122,12 +122,9 @@ class _Composite(torch.autograd.Function):
 
 class _CompositeField(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, features, sigmas, deltas, starts, counts, faint, density, *parameters):
+    def forward(ctx, features, sigmas, deltas, starts, counts, faint, *parameters):
         ctx.faint = np.float32(faint)
-        if sigmas is None:
-            sigmas = density.logits(features).clamp_(-LARGEST_LOGIT, LARGEST_LOGIT).exp_()
-        else:
-            sigmas = sigmas.clamp(min=float(np.exp(-LARGEST_LOGIT)))
+        sigmas = sigmas.clamp(min=float(np.exp(-LARGEST_LOGIT)))
         weights, taus = torch.zeros_like(sigmas), torch.empty_like(sigmas)
         out = features.new_empty(len(starts), features.shape[1])
         opacity = features.new_empty(len(starts))
@@ -147,7 +144,7 @@ class _CompositeField(torch.autograd.Function):
             *(_array(grad) for grad in grads), grad_logits.numpy(), grad_features.numpy(),
         )  # fmt: skip
         grad_logits *= sigmas
-        nothing = [None] * 6
+        nothing = [None] * 5
         grad_bias = grad_logits.sum().reshape(1)
         *hidden, weight, _ = parameters
         if not hidden:

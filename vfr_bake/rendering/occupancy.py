@@ -122,7 +122,7 @@ class OccupancyGrid:
         """Return the samples of all rays, in the middle of their intervals."""
         middle = torch.full((len(rays_o),), 0.5)
         rays = torch.from_numpy(rays_o), torch.from_numpy(rays_d)
-        return march(field, self.distance, self.step, *rays, middle, len(rays_o) * most_samples(self.step))[0]
+        return march(field, self.distance, self.step, *rays, middle, len(rays_o) * most_samples(self.step))
 
     def state(self) -> dict[str, Any]:
         """Return all that the next update depends on, in tensors and plain values."""

@@ -76,7 +76,6 @@ class ProposalSampler(nn.Module):
         for start in range(0, len(rays_o), RAY_CHUNK):
             rows = slice(start, start + RAY_CHUNK)
             samples = self.sample_all(field, rays_o[rows], rays_d[rows])
-            assert samples.sigmas is not None
             found = composite(
                 samples.sigmas, samples.features, samples.deltas, samples.starts, samples.counts
             )

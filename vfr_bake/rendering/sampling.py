@@ -43,9 +43,9 @@ def march(
     jitter: Tensor,
     budget: int,
     n_chunks: int = 2,
-) -> tuple[RaySamples, np.ndarray]:
-    """Return the samples of as many of the rays [n_rays, 3] as fit into `budget` samples, and the densities
-    [n_samples] that the march looked up there; `jitter` [n_rays] is in [0, 1).
+) -> RaySamples:
+    """Return the samples of as many of the rays [n_rays, 3] as fit into `budget` samples; `jitter` [n_rays]
+    is in [0, 1).
 
     The budget is raised if it cannot hold at least one whole ray per chunk.
     """
@@ -60,9 +60,8 @@ def march(
         rays_o.numpy(), rays_d.numpy(), jitter.numpy(), np.float32(step), distance, field.arrays(), LIMITS,
         counts, starts, t_mid, points, features, sigmas,
     )  # fmt: skip
-    first, joined = np.concatenate([[0], np.cumsum(used)]), _join(sigmas, used)
-    served = np.flatnonzero(counts >= 0)
-    samples = RaySamples(
+    first, served = np.concatenate([[0], np.cumsum(used)]), np.flatnonzero(counts >= 0)
+    return RaySamples(
         t_mid=torch.from_numpy(_join(t_mid, used)),
         deltas=torch.full((int(first[-1]),), step),
         points=torch.from_numpy(_join(points, used)),
@@ -70,9 +69,8 @@ def march(
         rays=torch.from_numpy(served),
         starts=torch.from_numpy(starts[served] + first[served % n_chunks]),
         counts=torch.from_numpy(counts[served]),
-        sigmas=torch.from_numpy(joined),
+        sigmas=torch.from_numpy(_join(sigmas, used)),
     )
-    return samples, joined
 
 
 def _join(chunks: np.ndarray, used: np.ndarray) -> np.ndarray:
@@ -82,9 +80,9 @@ def _join(chunks: np.ndarray, used: np.ndarray) -> np.ndarray:
 @torch.no_grad()
 def march_on_device(
     lookup: Lookup, occupied: Tensor, step: float, rays_o: Tensor, rays_d: Tensor, jitter: Tensor, budget: int
-) -> tuple[RaySamples, Tensor]:
-    """Return the samples of as many of the rays [n_rays, 3] as fit into `budget` samples, and the densities
-    [n_samples] there; `jitter` [n_rays] is in [0, 1).
+) -> RaySamples:
+    """Return the samples of as many of the rays [n_rays, 3] as fit into `budget` samples; `jitter` [n_rays]
+    is in [0, 1).
 
     In contrast to `march`, a ray is served if its visible samples fit, whose number is known here,
     and not only if the most samples that it could have would fit. The budget is raised if it cannot
@@ -104,7 +102,7 @@ def march_on_device(
     n_served = int((ends <= capacity).sum())
     counts = counts[:n_served]
     n = int(ends[n_served - 1]) if n_served else 0
-    samples = RaySamples(
+    return RaySamples(
         t_mid=t_mid[:n],
         deltas=torch.full_like(t_mid[:n], step),
         points=points[:n],
@@ -114,7 +112,6 @@ def march_on_device(
         counts=counts,
         sigmas=sigmas[:n],
     )
-    return samples, sigmas[:n]
 
 
 def _march_block(

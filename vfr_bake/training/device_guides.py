@@ -43,10 +43,8 @@ class DeviceOccupancyGuide(BoxGuide):
     ) -> RaySamples:
         grid, budget = self._grid, int(self._budget(pilot) * share)
         first = jitter[:, 0].contiguous()
-        samples, sigmas = march_on_device(
-            field.lookup, grid.occupied, self._step, rays_o, rays_d, first, budget
-        )
-        grid.observe(samples.points, sigmas)
+        samples = march_on_device(field.lookup, grid.occupied, self._step, rays_o, rays_d, first, budget)
+        grid.observe(samples.points, samples.sigmas)
         return samples
 
 
@@ -114,13 +112,14 @@ def field_samples(field: VfrField, rays_o: Tensor, rays_d: Tensor, edges: Tensor
     t_mid, lengths, points = fast(kernels.midpoints, edges.device)(rays_o, rays_d, edges)
     features, sigmas = field.lookup(points.reshape(-1, 3))
     kept = sums_before(sigmas.reshape(lengths.shape) * lengths) <= OPAQUE_DEPTH
-    counts = kept.sum(dim=1)
+    counts, places = kept.sum(dim=1), kept.reshape(-1).nonzero()[:, 0]
     return RaySamples(
-        t_mid=t_mid[kept],
-        deltas=lengths[kept],
-        points=points[kept],
-        features=features[kept.reshape(-1)],
+        t_mid=t_mid.reshape(-1)[places],
+        deltas=lengths.reshape(-1)[places],
+        points=points.reshape(-1, 3)[places],
+        features=features[places],
         rays=torch.arange(len(rays_o), device=rays_o.device),
         starts=torch.cumsum(counts, dim=0) - counts,
         counts=counts,
+        sigmas=sigmas[places],
     )

@@ -215,11 +215,9 @@ class OccupancyGuide(BoxGuide):
     ) -> RaySamples:
         grid, budget = self._grid, int(self._budget(pilot) * share)
         first = jitter[:, 0].contiguous()
-        samples, sigmas = march(
-            field, grid.distance, self._step, rays_o, rays_d, first, budget, self._n_chunks
-        )
+        samples = march(field, grid.distance, self._step, rays_o, rays_d, first, budget, self._n_chunks)
         if grid.n_updates > 0:
-            grid.observe(samples.points.numpy(), sigmas)
+            grid.observe(samples.points.numpy(), samples.sigmas.numpy())
         return samples
 
 

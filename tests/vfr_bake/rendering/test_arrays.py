@@ -80,8 +80,8 @@ for kind in ("object", "unbounded"):
     else:
         sampler = OccupancyGrid(8, 0.1, seed=0)
         sampler.set_occupied(np.random.default_rng(1).random((8, 8, 8)) < 0.4)
-        samples, sigmas = march(field, sampler.distance, 0.1, rays_o, rays_d, torch.full((5,), 0.5), 300)
-        found["sigmas"] = sigmas
+        samples = march(field, sampler.distance, 0.1, rays_o, rays_d, torch.full((5,), 0.5), 300)
+        found["sigmas"] = samples.sigmas.numpy()
         visible = np.zeros((9, 9, 9, 2), np.uint8)
         arguments = (np.float32(0.1), sampler.distance, field.arrays(), LIMITS)
         mark_visible_cells(rays_o.numpy(), rays_d.numpy(), *arguments, np.float32([0.01, 0.2]), visible)

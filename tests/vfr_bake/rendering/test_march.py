@@ -58,7 +58,7 @@ def test_march_finds_what_the_twin_finds(logit: float) -> None:
     field, occupancy = field_of_density(logit), half_full()
     rays_o, rays_d = rays()
     jitter = torch.rand(len(rays_o), generator=torch.Generator().manual_seed(4))
-    samples, sigmas = march(field, occupancy.distance, STEP, rays_o, rays_d, jitter, 200_000)
+    samples = march(field, occupancy.distance, STEP, rays_o, rays_d, jitter, 200_000)
     expected = twins.march(field, occupancy.occupied, rays_o, rays_d, jitter, STEP)
     assert samples.rays.tolist() == list(range(len(rays_o)))
     n_different = 0
@@ -72,18 +72,18 @@ def test_march_finds_what_the_twin_finds(logit: float) -> None:
     assert n_different <= 2
     assert len(samples.t_mid) > 200
     torch.testing.assert_close(samples.features, twins.encode(field.grid, samples.points), rtol=0, atol=1e-5)
-    np.testing.assert_allclose(sigmas, field.density(samples.features).detach().numpy(), rtol=1e-5)
+    np.testing.assert_allclose(samples.sigmas, field.density(samples.features).detach().numpy(), rtol=1e-5)
 
 
 def test_nothing_is_written_past_the_budget() -> None:
     field, occupancy = field_of_density(-9.0), OccupancyGrid(16, STEP, seed=0)
     rays_o, rays_d = rays(400)
     jitter = torch.zeros(len(rays_o))
-    samples, _ = march(field, occupancy.distance, STEP, rays_o, rays_d, jitter, 1000, n_chunks=2)
+    samples = march(field, occupancy.distance, STEP, rays_o, rays_d, jitter, 1000, n_chunks=2)
     assert 0 < len(samples.t_mid) <= 1000
     assert len(samples.rays) < len(rays_o)
     assert int(samples.counts.sum()) == len(samples.t_mid)
-    whole, _ = march(field, occupancy.distance, STEP, rays_o, rays_d, jitter, 400_000, n_chunks=2)
+    whole = march(field, occupancy.distance, STEP, rays_o, rays_d, jitter, 400_000, n_chunks=2)
     for ray, start, count in zip(samples.rays, samples.starts, samples.counts, strict=True):
         first = int(whole.starts[ray])
         assert torch.equal(samples.t_mid[start : start + count], whole.t_mid[first : first + int(count)])
@@ -92,9 +92,7 @@ def test_nothing_is_written_past_the_budget() -> None:
 def test_rendering_without_stored_samples_equals_rendering_with_them() -> None:
     field, occupancy = field_of_density(2.0), half_full()
     rays_o, rays_d = rays()
-    samples, _ = march(
-        field, occupancy.distance, STEP, rays_o, rays_d, torch.full((len(rays_o),), 0.5), 200_000
-    )
+    samples = march(field, occupancy.distance, STEP, rays_o, rays_d, torch.full((len(rays_o),), 0.5), 200_000)
     with torch.no_grad():
         sigmas = field.density(samples.features)
         out, opacity, _ = composite(sigmas, samples.features, samples.deltas, samples.starts, samples.counts)
@@ -106,7 +104,7 @@ def test_rendering_without_stored_samples_equals_rendering_with_them() -> None:
 def test_an_opaque_field_stops_at_its_first_samples() -> None:
     field, occupancy = field_of_density(12.0), OccupancyGrid(16, STEP, seed=0)
     rays_o, rays_d = rays()
-    samples, _ = march(field, occupancy.distance, STEP, rays_o, rays_d, torch.zeros(len(rays_o)), 100_000)
+    samples = march(field, occupancy.distance, STEP, rays_o, rays_d, torch.zeros(len(rays_o)), 100_000)
     assert int(samples.counts.max()) == 1
 
 
