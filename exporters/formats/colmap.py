@@ -15,15 +15,14 @@ import struct
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
-from typing import NamedTuple
 
 import numpy as np
 
 from exporters.formats.transforms import check_cameras
 from exporters.shapes.mesh import TriangleMesh
 from player.cameras.camera import Camera
-from player.cameras.colmap import MAX_FILE_BYTES
-from player.cameras.rotations import OPENGL_FROM_OPENCV, quaternion, rotation_matrix
+from player.cameras.colmap import MAX_FILE_BYTES, camera_of, parse_cameras, parse_images
+from player.cameras.rotations import OPENGL_FROM_OPENCV, quaternion
 from player.errors import FormatError, ParityError
 from player.files.files import read_bytes
 
@@ -39,28 +38,6 @@ _IMAGE = struct.Struct("<I7dI")  # number, pose and lens; then the name, a zero 
 _POINT = np.dtype(
     [("id", "<u8"), ("place", "<f8", 3), ("colour", "u1", 3), ("error", "<f8"), ("track_length", "<u8")]
 )
-
-
-class _Image(NamedTuple):
-    """A picture of a model."""
-
-    pose: list[float]
-    """Quaternion (w, x, y, z) and translation of the transform camera from world."""
-    lens: int
-    """The number of its COLMAP camera."""
-    name: str
-
-
-class _Model(NamedTuple):
-    """What the three files of a model hold."""
-
-    lenses: dict[int, tuple[float, ...]]
-    """Width, height, fx, fy, cx, cy of each COLMAP camera, by its number."""
-    images: list[_Image]
-    places: np.ndarray
-    """[n_points, 3] float64."""
-    colours: np.ndarray
-    """[n_points, 3] sRGB, 0 to 255."""
 
 
 def colmap_files(cameras: Sequence[Camera], cloud: TriangleMesh) -> dict[str, bytes]:
@@ -83,8 +60,9 @@ def colmap_files(cameras: Sequence[Camera], cloud: TriangleMesh) -> dict[str, by
     >>> list(colmap_files([camera], empty))
     ['cameras.bin', 'images.bin', 'points3D.bin']
     """
-    files = _written(_model(cameras, cloud))
-    _check(_parsed(files), cameras, cloud)
+    rigid = [_rigid(camera) for camera in cameras]
+    files = _written(rigid, cloud)
+    _check(files, rigid, cloud)
     return files
 
 
@@ -126,18 +104,6 @@ def _has_no_keypoints(data: bytes) -> bool:
     return at == len(data)
 
 
-def _model(cameras: Sequence[Camera], cloud: TriangleMesh) -> _Model:
-    lenses: dict[tuple[float, ...], int] = {}
-    images = []
-    for camera in cameras:
-        lens = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
-        lens_id = lenses.setdefault(lens, len(lenses) + 1)
-        w2c = np.linalg.inv(_rigid(camera).c2w @ OPENGL_FROM_OPENCV)
-        images.append(_Image([*quaternion(w2c[:3, :3]), *w2c[:3, 3]], lens_id, _name(camera)))
-    by_number = {number: lens for lens, number in lenses.items()}
-    return _Model(by_number, images, cloud.vertices.astype(np.float64), cloud.colours[:, :3])
-
-
 def _rigid(camera: Camera) -> Camera:
     """Return the camera as COLMAP can hold it: with COLMAP's name and the rotation nearest to its own."""
     u, _, v = np.linalg.svd(camera.c2w[:3, :3])
@@ -151,18 +117,22 @@ def _name(camera: Camera) -> str:
     return name if PurePosixPath(name).suffix else f"{name}.png"
 
 
-def _written(model: _Model) -> dict[str, bytes]:
-    lenses = np.zeros(len(model.lenses), _LENS)
-    numbers = np.array(list(model.lenses.values()), np.float64)
-    lenses["id"], lenses["model"] = list(model.lenses), _PINHOLE
-    lenses["size"], lenses["parameters"] = numbers[:, :2], numbers[:, 2:]
-    images = [
-        _IMAGE.pack(number, *image.pose, image.lens) + image.name.encode() + b"\0" + _COUNT.pack(0)
-        for number, image in enumerate(model.images, start=1)
-    ]
-    points = np.zeros(len(model.places), _POINT)
+def _written(cameras: Sequence[Camera], cloud: TriangleMesh) -> dict[str, bytes]:
+    numbers: dict[tuple[float, ...], int] = {}
+    images = []
+    for number, camera in enumerate(cameras, start=1):
+        lens = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
+        lens_number = numbers.setdefault(lens, len(numbers) + 1)
+        w2c = np.linalg.inv(camera.c2w @ OPENGL_FROM_OPENCV)
+        image = _IMAGE.pack(number, *quaternion(w2c[:3, :3]), *w2c[:3, 3], lens_number)
+        images.append(image + camera.name.encode() + b"\0" + _COUNT.pack(0))
+    rows = np.array(list(numbers), np.float64)
+    lenses = np.zeros(len(rows), _LENS)
+    lenses["id"], lenses["model"] = list(numbers.values()), _PINHOLE
+    lenses["size"], lenses["parameters"] = rows[:, :2], rows[:, 2:]
+    points = np.zeros(len(cloud.vertices), _POINT)
     points["id"] = np.arange(1, len(points) + 1)
-    points["place"], points["colour"] = model.places, model.colours
+    points["place"], points["colour"] = cloud.vertices, cloud.colours[:, :3]
     cameras_file, images_file, points_file = FILES
     return {
         cameras_file: _COUNT.pack(len(lenses)) + lenses.tobytes(),
@@ -171,38 +141,17 @@ def _written(model: _Model) -> dict[str, bytes]:
     }
 
 
-def _parsed(files: dict[str, bytes]) -> _Model:
-    lens_data, image_data, point_data = (files[name] for name in FILES)
-    n_lenses, n_images, n_points = (
-        _COUNT.unpack_from(data)[0] for data in (lens_data, image_data, point_data)
+def _check(files: dict[str, bytes], cameras: Sequence[Camera], cloud: TriangleMesh) -> None:
+    """Raise ParityError unless the files hold the cameras and the points."""
+    cameras_file, images_file, points_file = FILES
+    lenses = parse_cameras(files[cameras_file], cameras_file)
+    images = parse_images(files[images_file], images_file)
+    check_cameras(
+        cameras, [camera_of(image, lenses[image.camera_id]) for image in images], images_file, TOLERANCE
     )
-    lenses = {
-        int(lens["id"]): (*lens["size"].tolist(), *lens["parameters"].tolist())
-        for lens in np.frombuffer(lens_data, _LENS, n_lenses, _COUNT.size)
-    }
-    images, at = [], _COUNT.size
-    for _ in range(n_images):
-        _, *pose, lens = _IMAGE.unpack_from(image_data, at)
-        at += _IMAGE.size
-        end = image_data.index(b"\0", at)
-        images.append(_Image(pose, lens, image_data[at:end].decode()))
-        at = end + 1 + _COUNT.size
-    points = np.frombuffer(point_data, _POINT, n_points, _COUNT.size)
-    return _Model(lenses, images, points["place"], points["colour"])
-
-
-def _check(read: _Model, cameras: Sequence[Camera], cloud: TriangleMesh) -> None:
-    """Raise ParityError unless the model that was read back holds the cameras and the points."""
-    found = []
-    for image in read.images:
-        w2c = np.eye(4)
-        w2c[:3, :3] = rotation_matrix(np.array(image.pose[:4]))
-        w2c[:3, 3] = image.pose[4:]
-        width, height, *lens = read.lenses[image.lens]
-        c2w = np.linalg.inv(w2c) @ OPENGL_FROM_OPENCV
-        found.append(Camera(image.name, c2w, int(width), int(height), *lens))
-    check_cameras([_rigid(camera) for camera in cameras], found, FILES[1], TOLERANCE)
+    points = np.frombuffer(files[points_file], _POINT, offset=_COUNT.size)
     expected = (cloud.vertices, cloud.colours[:, :3])
-    if not all(map(np.array_equal, expected, (read.places, read.colours))):
-        n_expected, n_read = len(cloud.vertices), len(read.places)
-        raise ParityError(f"{FILES[2]}: expected {n_expected} points as sampled, got {n_read} others")
+    if not all(map(np.array_equal, expected, (points["place"], points["colour"]))):
+        raise ParityError(
+            f"{points_file}: expected {len(cloud.vertices)} points as sampled, got {len(points)} others"
+        )

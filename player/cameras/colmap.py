@@ -105,25 +105,34 @@ def read_views(model: Path, say: Callable[[str], object] = lambda text: None) ->
         if image.camera_id not in lenses:
             raise FormatError(f"{model}: {image.name}: camera {image.camera_id} is not in cameras.{suffix}")
         lens = lenses[image.camera_id]
-        size = (lens.width, lens.height)
-        views.append(Camera(image.name, image.c2w, *size, lens.fx, lens.fy, lens.cx, lens.cy))
+        views.append(camera_of(image, lens))
         n_distorted += any(lens.distortion.values())
     if n_distorted:
         say(f"{model}: lens distortion of {n_distorted} of {len(views)} cameras is ignored")
     return views
 
 
+def camera_of(image: RegisteredImage, lens: Lens) -> Camera:
+    """Return the pinhole camera of a picture, without the distortion of its lens."""
+    return Camera(image.name, image.c2w, lens.width, lens.height, lens.fx, lens.fy, lens.cx, lens.cy)
+
+
 def read_cameras(path: Path) -> dict[int, Lens]:
     """Read the lenses in `cameras.bin`, by camera number. Raises FormatError, DataError (an unknown
     model)."""
-    file = _Reader(path)
+    return parse_cameras(_content(path), str(path))
+
+
+def parse_cameras(data: bytes, where: str) -> dict[int, Lens]:
+    """Do the same as `read_cameras` for the file's content; `where` names the file in messages."""
+    file = _Reader(data, where)
     lenses = {}
     for _ in range(file.count(24)):
         camera_id, model, width, height = file.take("<iiQQ")
         if model not in MODELS:
-            raise _unknown_model(f"{path}: camera {camera_id}", f"number {model}")
+            raise _unknown_model(f"{where}: camera {camera_id}", f"number {model}")
         values = file.take(f"<{len(MODELS[model][1])}d")
-        lenses[camera_id] = _lens(model, width, height, values, f"{path}: camera {camera_id}")
+        lenses[camera_id] = _lens(model, width, height, values, f"{where}: camera {camera_id}")
     file.end()
     return lenses
 
@@ -149,20 +158,25 @@ def _lens(model: int, width: float, height: float, parameters: Sequence[float], 
 
 def read_images(path: Path) -> list[RegisteredImage]:
     """Read the pictures in `images.bin`, in the file's order. Raises FormatError."""
-    file = _Reader(path)
+    return parse_images(_content(path), str(path))
+
+
+def parse_images(data: bytes, where: str) -> list[RegisteredImage]:
+    """Do the same as `read_images` for the file's content; `where` names the file in messages."""
+    file = _Reader(data, where)
     images = []
     for _ in range(file.count(73)):
         _, *pose, camera_id = file.take("<i7di")
         name = file.text()
         file.skip(24 * file.count(24))
-        images.append(RegisteredImage(name, camera_id, _c2w(np.array(pose), f"{path}: {name}")))
+        images.append(RegisteredImage(name, camera_id, _c2w(np.array(pose), f"{where}: {name}")))
     file.end()
     return images
 
 
 def read_points(path: Path) -> np.ndarray:
     """Read the points [n_points, 3] of `points3D.bin`, world frame. Raises FormatError."""
-    file = _Reader(path)
+    file = _Reader(_content(path), str(path))
     points = []
     for _ in range(file.count(51)):
         points.append(file.take("<Q3d")[1:])
@@ -240,13 +254,15 @@ def _floats(words: list[str], where: str) -> list[float]:
     return values
 
 
+def _content(path: Path) -> bytes:
+    return read_bytes(path, "a COLMAP model in binary form", MAX_FILE_BYTES)
+
+
 class _Reader:
     """Reader of a little-endian binary file, which checks every read against the bytes that are left."""
 
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        self._data = read_bytes(path, "a COLMAP model in binary form", MAX_FILE_BYTES)
-        self._at = 0
+    def __init__(self, data: bytes, where: str) -> None:
+        self._data, self._where, self._at = data, where, 0
 
     def take(self, form: str) -> tuple:
         start = self._at
@@ -255,28 +271,30 @@ class _Reader:
 
     def skip(self, n_bytes: int) -> None:
         if n_bytes > len(self._data) - self._at:
-            raise FormatError(f"{self._path}: cut short at byte {len(self._data)}")
+            raise FormatError(f"{self._where}: cut short at byte {len(self._data)}")
         self._at += n_bytes
 
     def count(self, least_bytes: int) -> int:
         """Read a count of entries, and check that so many of at least `least_bytes` each still fit."""
         (n,) = self.take("<Q")
         if n * least_bytes > len(self._data) - self._at:
-            raise FormatError(f"{self._path}: cut short: {n} entries do not fit into {len(self._data)} bytes")
+            raise FormatError(
+                f"{self._where}: cut short: {n} entries do not fit into {len(self._data)} bytes"
+            )
         return n
 
     def text(self) -> str:
         end = self._data.find(b"\0", self._at)
         if end < 0:
-            raise FormatError(f"{self._path}: cut short in a name")
+            raise FormatError(f"{self._where}: cut short in a name")
         raw, self._at = self._data[self._at : end], end + 1
         try:
             return raw.decode()
         except UnicodeDecodeError:
-            raise FormatError(f"{self._path}: name: expected UTF-8, got {raw[:40]!r}") from None
+            raise FormatError(f"{self._where}: name: expected UTF-8, got {raw[:40]!r}") from None
 
     def end(self) -> None:
         if self._at != len(self._data):
             raise FormatError(
-                f"{self._path}: expected the end at byte {self._at}, got {len(self._data)} bytes"
+                f"{self._where}: expected the end at byte {self._at}, got {len(self._data)} bytes"
             )

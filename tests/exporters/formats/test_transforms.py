@@ -15,6 +15,7 @@ from exporters.formats.axes import COORDINATES, coordinates_from_world
 from exporters.formats.colmap import FILES, colmap_files
 from exporters.formats.points import sample_points
 from exporters.formats.transforms import check_cameras, moved_cameras, transforms_bytes
+from exporters.shapes.mesh import TriangleMesh
 from player.asset.asset import Asset
 from player.cameras.camera import Camera
 from player.cameras.colmap import Lens, read_images, read_points, read_views
@@ -177,14 +178,14 @@ def test_colmap_parity(monkeypatch: pytest.MonkeyPatch) -> None:
     corners = box((0, 0, 0), (1, 1, 1))
     write = colmap._written
 
-    def renamed(model: colmap._Model) -> dict[str, bytes]:
-        return write(model._replace(images=[image._replace(name="a c") for image in model.images]))
+    def renamed(cameras: list[Camera], cloud: TriangleMesh) -> dict[str, bytes]:
+        return write([replace(camera, name="a c") for camera in cameras], cloud)
 
-    def black(model: colmap._Model) -> dict[str, bytes]:
-        return write(model._replace(colours=np.zeros_like(model.colours)))
+    def black(cameras: list[Camera], cloud: TriangleMesh) -> dict[str, bytes]:
+        return write(cameras, replace(cloud, colours=np.zeros_like(cloud.colours)))
 
-    def rounded(model: colmap._Model) -> dict[str, bytes]:
-        return write(model._replace(places=model.places.round(3)))
+    def rounded(cameras: list[Camera], cloud: TriangleMesh) -> dict[str, bytes]:
+        return write(cameras, replace(cloud, vertices=cloud.vertices.round(3)))
 
     monkeypatch.setattr(colmap, "_written", renamed)
     with pytest.raises(ParityError, match=r"images\.bin: camera: expected a b\.png 4x3, got a c 4x3"):
