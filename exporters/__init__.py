@@ -6,7 +6,7 @@ another room of its own row or of a row below:
 
 | room | what is in it |
 |---|---|
-| `extras`, `progress`, `options` | optional packages; progress reports; formats and settings |
+| `extras`, `options` | optional packages; formats and settings |
 | `shapes` | the data that are exported: meshes, colours, textures, crops, volumes |
 | `mesh`, `formats`, `head` | operations on meshes; file formats, one per module; the head as ONNX |
 | `surface` | extraction of an asset's surface, and its colours |

@@ -103,9 +103,7 @@ def export_asset(
         notes: list[str] = []
         cameras, names = _views(asset, options, notes.append)
         progress = partial(report, "picture")
-        facts = export_pictures(
-            asset, target, cameras, names, options.half, force, options.max_memory, progress
-        )
+        facts = export_pictures(asset, target, cameras, names, options, force, progress)
         facts |= {"notes": notes} if notes else {}
     elif name in ("html", "web"):
         facts = export_page(asset, target, name, options.max_gpu_mb, force)

@@ -10,13 +10,14 @@ import numpy as np
 
 from exporters.formats.exr import exr_channels, exr_header, load_openexr, write_exr
 from exporters.formats.parity import COARSEST
+from exporters.options import ExportOptions
 from exporters.surface.marching_cubes import voxel_size
 from player.asset.asset import Asset
 from player.cameras.camera import Camera
 from player.errors import ConfigError
 from player.files.files import new_folder
 from player.files.memory import allowed_bytes, check_memory
-from player.progress import Progress, silent
+from player.progress import Progress
 from player.render import Renderer, check_size
 
 BYTES_A_PIXEL, BYTES_A_FEATURE = 230, 8
@@ -29,10 +30,9 @@ def export_pictures(
     target: Path,
     cameras: Sequence[Camera],
     names: Sequence[str],
-    half: bool = False,
-    force: bool = False,
-    max_memory: float | None = None,
-    progress: Progress = silent,
+    options: ExportOptions,
+    force: bool,
+    progress: Progress,
 ) -> dict[str, Any]:
     """Render each camera with the asset's own number of feature lookups per ray, and write `target/NAME.exr`.
 
@@ -44,9 +44,8 @@ def export_pictures(
         target: the new folder; it appears when every picture is in it.
         cameras: WORLD frame, at least one.
         names: names of the files without suffix, one per camera (`player.cameras.transforms.frame_names`).
-        half: see `exporters.formats.exr`.
+        options: the settings, already checked for this format.
         force: replace a folder that exists.
-        max_memory: gigabytes that a picture may take, as `Asset.open` has it for the asset.
         progress: called with the number done and the total after each picture.
 
     Returns:
@@ -63,13 +62,13 @@ def export_pictures(
         check_size(camera.width, camera.height)
     n_pixels = max(camera.width * camera.height for camera in cameras)
     n_bytes_a_pixel = BYTES_A_PIXEL + BYTES_A_FEATURE * asset.manifest.n_channels
-    check_memory(n_pixels * n_bytes_a_pixel, allowed_bytes(max_memory), f"{target}: a picture")
+    check_memory(n_pixels * n_bytes_a_pixel, allowed_bytes(options.max_memory), f"{target}: a picture")
     places = _float32_holds_places(asset, cameras)
     n_bytes, written = 0, []
     with new_folder(target, force) as folder, Renderer(asset) as renderer:
         for done, (camera, name) in enumerate(zip(cameras, names, strict=True), start=1):
             frame = renderer.render(camera, background="transparent", layers=True)
-            channels = exr_channels(frame, camera, half, places)
+            channels = exr_channels(frame, camera, options.half, places)
             path = folder / f"{name}.exr"
             write_exr(path, channels, exr_header(camera, places))
             n_bytes, written = n_bytes + path.stat().st_size, list(channels)

@@ -43,8 +43,7 @@ def textured_obj_files(mesh: TriangleMesh, texture: Texture, stem: str) -> dict[
     """Return the files of a mesh with a texture by suffix, `.png`, `.mtl` and `.obj`; they refer to each
     other as `stem` plus suffix.
 
-    Raises ConfigError for a coordinate of 1e15 or more, or a stem that is empty or has spaces, which
-    an MTL file cannot quote.
+    Raises ConfigError for a coordinate of 1e15 or more. `check_stem` tells which stems are allowed.
 
     >>> corners = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
     >>> up, white = np.tile([0.0, 0.0, 1.0], (3, 1)), np.full((3, 4), 255, np.uint8)
@@ -54,7 +53,6 @@ def textured_obj_files(mesh: TriangleMesh, texture: Texture, stem: str) -> dict[
     >>> files[".obj"].decode().splitlines()[-1], "map_Kd one.png" in files[".mtl"].decode()
     ('f 1/1/1 2/2/2 3/3/3', True)
     """
-    check_stem(stem)
     flipped = np.stack([texture.uvs[:, 0], 1 - texture.uvs[:, 1].astype(np.float64)], axis=-1)
     obj = b"".join(
         [
@@ -71,8 +69,8 @@ def textured_obj_files(mesh: TriangleMesh, texture: Texture, stem: str) -> dict[
 
 
 def check_stem(stem: str) -> None:
-    """Raise ConfigError if the files of a mesh with a texture cannot have this stem. It is also called before
-    long work."""
+    """Raise ConfigError if the files of a mesh with a texture cannot have this stem: if it is empty or has
+    spaces, which an MTL file cannot quote."""
     if not stem or any(character.isspace() for character in stem):
         raise ConfigError(
             f"OBJ: name: expected one without spaces, which MTL files cannot name, got {stem!r}"

@@ -117,25 +117,23 @@ def check_points_bytes(data: bytes, cloud: TriangleMesh, where: str) -> None:
 def check_volume_bytes(suffix: str, data: bytes, volume: Volume, where: str) -> None:
     """Raise ParityError if `data`, the content of a `suffix` (.vdb, .npz) file, holds another volume. Every
     vertex, density, colour and the matrix are compared, exactly but for linear colours in float32."""
-    if suffix == ".npz":
-        got = parse_npz(data, where)
-        density = VdbGrid(got.index, got.density[:, None], got.matrix)
-        colours = None if got.colours is None else VdbGrid(got.index, got.colours, got.matrix)
-    else:
-        grids = parse_vdb(data, where)
-        density, colours = grids["density"], grids.get("color")
-    expected = VdbGrid(volume.index, volume.density[:, None], volume.matrix)
-    _check_grid(where, "density", expected, density, 0.0)
-    if volume.colours is None or colours is None:
-        if volume.colours is not colours:
-            wanted = "none" if volume.colours is None else "some"
-            raise ParityError(f"{where}: colours: expected {wanted}, got the other")
-    elif suffix == ".npz":
-        expected = VdbGrid(volume.index, volume.colours, volume.matrix)
-        _check_grid(where, "colours", expected, colours, 0.0)
-    else:
-        expected = VdbGrid(*colour_voxels(volume.index, volume.colours), volume.matrix)
-        _check_grid(where, "colours", expected, colours, LINEAR_TOLERANCE)
+    is_vdb = suffix == ".vdb"
+    expected = _grids(volume, is_vdb)
+    got = parse_vdb(data, where) if is_vdb else _grids(parse_npz(data, where), is_vdb)
+    if set(expected) != set(got):
+        raise ParityError(f"{where}: grids: expected {sorted(expected)}, got {sorted(got)}")
+    for name, grid in expected.items():
+        tolerance = LINEAR_TOLERANCE if is_vdb and name == "color" else 0.0
+        _check_grid(where, name, grid, got[name], tolerance)
+
+
+def _grids(volume: Volume, is_vdb: bool) -> dict[str, VdbGrid]:
+    """Return the grids of a volume, by the names that a VDB gives them; in one, colours are linear light."""
+    grids = {"density": VdbGrid(volume.index, volume.density[:, None], volume.matrix)}
+    if volume.colours is not None:
+        voxels = colour_voxels(volume.index, volume.colours) if is_vdb else (volume.index, volume.colours)
+        grids["color"] = VdbGrid(*voxels, volume.matrix)
+    return grids
 
 
 def _check_grid(where: str, what: str, expected: VdbGrid, got: VdbGrid, tolerance: float) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 from exporters.formats.ply import HEADER as MESH_HEADER
 from exporters.formats.ply import VERTEX, vertex_rows
 from exporters.shapes.mesh import TriangleMesh, crossed_edges, interpolated
-from player.errors import ConfigError, DataError, FormatError
+from player.errors import DataError, FormatError
 
 HEADER = MESH_HEADER.split("element face")[0] + "end_header\n"
 _PATTERN = re.compile(HEADER.format(n_vertices="(0|[1-9][0-9]{0,9})").encode())
@@ -32,9 +32,7 @@ def sample_points(mesh: TriangleMesh, n_points: int) -> TriangleMesh:
     Returns:
         A cloud: `vertices`, `normals`, `colours` of n_points rows, no faces.
 
-    Raises:
-        ConfigError: `n_points` below 1.
-        DataError: the mesh has no area.
+    Raises DataError: the mesh has no area.
 
     >>> corners = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
     >>> up, white = np.tile([0.0, 0.0, 1.0], (3, 1)), np.full((3, 4), 255, np.uint8)
@@ -42,8 +40,6 @@ def sample_points(mesh: TriangleMesh, n_points: int) -> TriangleMesh:
     >>> cloud.vertices.shape, bool((cloud.vertices.sum(axis=1) <= 1).all())
     ((50, 3), True)
     """
-    if n_points < 1:
-        raise ConfigError(f"--points: expected 1 or more, got {n_points}")
     areas = np.linalg.norm(crossed_edges(mesh.vertices, mesh.faces), axis=-1)
     running = np.cumsum(areas)
     if not len(areas) or not running[-1] > 0:

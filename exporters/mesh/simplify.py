@@ -17,7 +17,6 @@ import numpy as np
 
 from exporters.extras import needs, require_open3d
 from exporters.shapes.mesh import TriangleMesh, has_three_corners, unit_normals
-from player.errors import ConfigError
 from player.files.images import to_8_bit
 
 FIRST = 12
@@ -38,17 +37,13 @@ def simplify_mesh(mesh: TriangleMesh, n_faces: int) -> TriangleMesh:
         mesh: any mesh; parts that are not connected are simplified together.
         n_faces: 1 or more; a closed surface needs 4.
 
-    Raises:
-        ConfigError: `n_faces` below 1.
-        MissingExtraError: Open3D is not installed.
+    Raises MissingExtraError: Open3D is not installed.
 
     >>> empty = TriangleMesh(np.zeros((0, 3)), np.zeros((0, 3), np.int32), np.zeros((0, 3)),
     ...     np.zeros((0, 4), np.uint8))
     >>> simplify_mesh(empty, 100) is empty
     True
     """
-    if n_faces < 1:
-        raise ConfigError(f"--faces: expected 1 or more, got {n_faces}")
     cube, first = 0.0, max(FIRST * n_faces, LEAST_FIRST)
     if len(mesh.faces) > 2 * first:
         cube = mean_edge(mesh.vertices, mesh.faces) * (len(mesh.faces) / first) ** 0.5

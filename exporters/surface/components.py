@@ -6,7 +6,6 @@ import numpy as np
 
 from exporters.extras import needs
 from exporters.shapes.mesh import TriangleMesh, take_faces
-from player.errors import ConfigError
 
 
 def remove_small_components(mesh: TriangleMesh, min_fraction: float) -> tuple[TriangleMesh, int]:
@@ -17,12 +16,8 @@ def remove_small_components(mesh: TriangleMesh, min_fraction: float) -> tuple[Tr
         mesh: the mesh, whose parts are connected through shared vertices.
         min_fraction: share of the faces, 0 (keep all) to 1; the largest part always stays.
 
-    Raises:
-        ConfigError: `min_fraction` is not between 0 and 1.
-        MissingExtraError: scipy is not installed.
+    Raises MissingExtraError: scipy is not installed.
     """
-    if not 0 <= min_fraction <= 1:
-        raise ConfigError(f"surface: min_fraction: expected 0 to 1, got {min_fraction}")
     if not len(mesh.faces):
         return mesh, 0
     with needs("the mesh", "scipy"):

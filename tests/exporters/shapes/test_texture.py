@@ -13,7 +13,7 @@ import trimesh
 from PIL import Image
 
 from exporters.formats.glb import glb_bytes, parse_glb
-from exporters.formats.obj import textured_obj_files
+from exporters.formats.obj import check_stem, textured_obj_files
 from exporters.formats.parity import check_mesh_bytes, check_textured_obj
 from exporters.shapes.colour import linear_from_srgb
 from exporters.shapes.mesh import TriangleMesh
@@ -128,9 +128,9 @@ def test_equal_pictures_are_compared_in_little_memory() -> None:
 
 
 def test_refusals() -> None:
-    mesh, texture = cornered()
+    _, texture = cornered()
     with pytest.raises(ConfigError, match="expected one without spaces"):
-        textured_obj_files(mesh, texture, "my scene")
+        check_stem("my scene")
     with pytest.raises(ShapeError, match="texture: uvs"):
         Texture(np.zeros((3, 3), np.float32), texture.image)
     with pytest.raises(ShapeError, match="texture: image"):

@@ -183,8 +183,8 @@ def test_parity_names_the_worst(suffix: str) -> None:
     for changed, what in (
         (replace(volume, density=density), "a: density: number"),
         (replace(volume, index=index), "a: vertices: number"),
-        (replace(volume, colours=colours), "a: colours: number"),
-        (replace(volume, colours=None), "a: colours: expected some"),
+        (replace(volume, colours=colours), "a: color: number"),
+        (replace(volume, colours=None), r"a: grids: expected \['color', 'density'\], got \['density'\]"),
         (replace(volume, matrix=np.eye(4)), "a: matrix: number"),
         (some_volume(20), "a: vertices: expected"),
     ):

@@ -5,11 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import pytest
 
 from exporters.shapes.mesh import TriangleMesh
 from exporters.surface.components import remove_small_components
-from player.errors import ConfigError
 from tests.exporters.meshes import tetrahedron
 
 
@@ -32,5 +30,3 @@ def test_floaters_are_removed() -> None:
     assert remove_small_components(two_parts(), 1.0)[1] == 1  # the largest part always stays
     empty = replace(mesh, faces=mesh.faces[:0])
     assert remove_small_components(empty, 0.5) == (empty, 0)
-    with pytest.raises(ConfigError, match="min_fraction"):
-        remove_small_components(mesh, 2.0)
