@@ -25,6 +25,7 @@ from vfr_bake.cli import bake_main, eval_main, train_main
 from vfr_bake.commands.train import EVAL_VIEWS, _as_folder, _find_cameras, _test_figures
 from vfr_bake.config import EFFORT_MINUTES, TrainConfig
 from vfr_bake.data import load_scene
+from vfr_bake.data.files.estimate_record import EstimateRecord
 from vfr_bake.data.poses import PoseReport
 from vfr_bake.data.scene import PosedImages
 from vfr_bake.evaluation import RenderedView
@@ -448,7 +449,7 @@ def test_a_folder_called_demo_is_not_the_built_in_scene(
 
     def estimate(folder: Path, *_: object) -> PoseReport:
         estimated.append(folder)
-        return PoseReport(folder, 12, 12, 0.5, 3.0)
+        return PoseReport(folder, 12, 12, 0.5, 3.0, EstimateRecord(True))
 
     monkeypatch.setattr("vfr_bake.data.poses.estimate_cameras", estimate)
     for name in ("demo", "./demo"):

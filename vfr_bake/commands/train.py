@@ -278,7 +278,7 @@ def _find_cameras(data: str, say: Callable[[str], object], scale: tuple[str, str
     with Bars() as bars:
         report = estimate_cameras(folder, bars.count, say)
     _say(printable(report.summary()))
-    for name, reason in report.unplaced.items():
+    for name, reason in report.record.unplaced.items():
         _say(f"  no place for {printable(name)}: {printable(reason)}")
 
 

@@ -20,24 +20,10 @@ from vfr_bake.data.files.source import check_source
 from vfr_bake.data.files.video import frames_folder
 from vfr_bake.data.folders import has_transforms, load_folder
 from vfr_bake.data.poses import is_video
-from vfr_bake.data.scene import PosedImages, Scene, build_scene
+from vfr_bake.data.scene import Scene, build_scene
 from vfr_bake.data.store.reading import DescribingReader, PictureReader
 from vfr_bake.data.store.working import MAX_SIDE, WorkingSize
 from vfr_bake.data.world import named, scaled
-
-__all__ = [
-    "PosedImages",
-    "Scene",
-    "check_scale",
-    "check_settings",
-    "load_scene",
-    "load_scene_as",
-    "needs_cameras",
-    "reader_as",
-    "training_reader",
-    "unpacked",
-    "working_size",
-]
 
 
 def load_scene(

@@ -52,10 +52,11 @@ def load_folder(
         raise DataError(f"{folder}: no such folder: expected one with pictures and cameras, or the word demo")
     if not folder.is_dir():
         raise DataError(f"{folder}: expected a folder with a transforms.json or a COLMAP model, got a file")
+    reader = reader or PictureReader()
     if has_transforms(folder):
         return load_transforms_folder(folder, progress, reader)
-    if colmap_folder(folder):
-        return load_colmap_folder(folder, progress, reader)
+    if (model := colmap_folder(folder)) is not None:
+        return load_colmap_folder(folder, model, progress, reader)
     if find_pictures(folder)[1]:
         found = "pictures alone: vfr-train estimates their cameras"
     else:
@@ -66,9 +67,7 @@ def load_folder(
     )
 
 
-def load_transforms_folder(
-    folder: Path, progress: Progress | None = None, reader: PictureReader | None = None
-) -> Capture:
+def load_transforms_folder(folder: Path, progress: Progress | None, reader: PictureReader) -> Capture:
     """Load the pictures of `folder` with their cameras from `transforms_train.json` and
     `transforms_test.json`, or from one `transforms.json`, split as its lists say if it has any (`_listed`).
 
@@ -77,7 +76,6 @@ def load_transforms_folder(
     train_file, test_file = folder / "transforms_train.json", folder / "transforms_test.json"
     if not train_file.exists():
         train_file = folder / "transforms.json"
-    reader = reader or PictureReader()
     document = load_transforms(train_file)
     train = _described_views(document, train_file, reader.say)
     if train_file.name == "transforms_train.json" and test_file.exists():
@@ -311,9 +309,9 @@ def _picture_path(transforms: Path, index: int, frame: dict[str, Any]) -> Path:
 
 
 def load_colmap_folder(
-    folder: Path, progress: Progress | None = None, reader: PictureReader | None = None
+    folder: Path, model: Path, progress: Progress | None, reader: PictureReader
 ) -> Capture:
-    """Load the pictures of `folder` that are registered in its COLMAP model, in the order of their names.
+    """Load the pictures of `folder` that are registered in its COLMAP `model`, in the order of their names.
 
     Pictures are looked for in `images/` and in the folder itself; every eighth is held out. The pixels are
     taken as stored, unless this project estimated the model from upright pictures, or the cameras belong to
@@ -324,15 +322,13 @@ def load_colmap_folder(
     Raises DataError (pictures, camera models) or FormatError (the model's files), in one line that names the
     file.
     """
-    model = colmap_folder(folder)
-    assert model is not None
     lenses = read_cameras(model / "cameras.bin")
     registered = sorted(read_images(model / "images.bin"), key=lambda image: image.name)
     if len(registered) < 2:
         raise DataError(f"{model}: registered pictures: expected at least 2, got {len(registered)}")
     points_file = model / "points3D.bin"
     points = read_points(points_file) if points_file.exists() else None
-    record, reader = read_record(model), reader or PictureReader()
+    record = read_record(model)
     if (n_models := len(numbered_models(model))) > 1:
         reader.say(f"of {n_models} COLMAP models {model} is used, which has the most pictures")
     if record.upright:

@@ -5,8 +5,8 @@ from __future__ import annotations
 
 import struct
 import tempfile
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -81,23 +81,18 @@ class PoseReport:
     the mean over the points."""
     mean_track_length: float
     """Number of pictures that a point is seen in, on average."""
-    unplaced: Mapping[str, str] = field(default_factory=dict)
-    """The reason why a picture was not placed, by the picture's name."""
-    repeated: dict[str, str] = field(default_factory=dict)
-    """Names of pictures that were left out, each with the name of the picture that shows the same."""
-    apart: tuple[int, ...] = ()
-    """Number of pictures in each further group, whose pictures were placed relative to each other but not to
-    the rest."""
+    record: EstimateRecord
+    """What the estimate records of pictures that were left out or not placed."""
 
     def summary(self) -> str:
         """Return one sentence for the person who took the pictures.
 
-        >>> PoseReport(Path("garden"), 50, 48, 0.61, 7.25).summary()
+        >>> PoseReport(Path("garden"), 50, 48, 0.61, 7.25, EstimateRecord(True)).summary()
         'garden: cameras of 48 of 50 pictures, off by 0.61 pixels, a point is seen in 7.2 pictures'
         """
         left_out = ""
-        if self.repeated:
-            n, (name, kept) = len(self.repeated), next(iter(self.repeated.items()))
+        if repeated := self.record.repeated:
+            n, (name, kept) = len(repeated), next(iter(repeated.items()))
             others = f"{name} and {n - 1} more show" if n > 1 else f"{name} shows"
             left_out = (
                 f"; {others} what another picture ({kept}) does, and {'are' if n > 1 else 'is'} left out"
@@ -109,12 +104,12 @@ class PoseReport:
         )
 
     def _largest_taken(self) -> str:
-        if not self.apart:
+        if not (apart := self.record.apart):
             return ""
-        groups = " and ".join(map(str, self.apart))
+        groups = " and ".join(map(str, apart))
         return (
-            f"; of {len(self.apart) + 1} groups of pictures that show too little in common the largest is "
-            f"taken, the {'other has' if len(self.apart) == 1 else 'others have'} {groups}"
+            f"; of {len(apart) + 1} groups of pictures that show too little in common the largest is "
+            f"taken, the {'other has' if len(apart) == 1 else 'others have'} {groups}"
         )
 
 
@@ -457,7 +452,5 @@ def _read_report(model: Path, folder: Path, n_pictures: int) -> PoseReport:
         n_registered,
         error_sum / max(n_points, 1),
         n_seen / max(n_points, 1),
-        record.unplaced,
-        record.repeated,
-        record.apart,
+        record,
     )

@@ -17,6 +17,7 @@ from player.errors import DataError, OutputError
 from tests.vfr_bake.data.check.test_check import walk
 from tests.vfr_bake.data.files.test_video import write_video
 from vfr_bake.cli import train_main
+from vfr_bake.data.files.estimate_record import EstimateRecord
 from vfr_bake.data.files.masks import stray_masks
 from vfr_bake.data.poses import PoseReport
 from vfr_bake.training.checkpoint import checkpoint_path
@@ -126,7 +127,7 @@ def test_masks_of_no_picture_are_told_of_once(
     def estimate(folder: Path, progress: Any, say: Any) -> PoseReport:
         say(stray_masks(folder, []))
         cameras.rename(photos / cameras.name)
-        return PoseReport(folder, 12, 12, 0.5, 3.0)
+        return PoseReport(folder, 12, 12, 0.5, 3.0, EstimateRecord(True))
 
     monkeypatch.setattr("vfr_bake.data.poses.estimate_cameras", estimate)
     monkeypatch.setattr("vfr_bake.commands.train._warn_of_folds", interrupt)

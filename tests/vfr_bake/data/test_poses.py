@@ -300,7 +300,7 @@ def test_pictures_without_a_place_and_why(can, tmp_path: Path):
     Image.fromarray(textured(3, *size)).save(photos / "other.jpg")
     report = estimate_cameras(photos, quiet)
     assert report.n_registered == 8
-    assert report.unplaced == {
+    assert report.record.unplaced == {
         "blank.jpg": "blank, blurred or out of focus: 0 features",
         "other.jpg": "nothing in common with any other picture",
     }
@@ -422,7 +422,7 @@ def test_bursts_and_copies_are_left_out(can, tmp_path: Path):
     shaken = cv2.GaussianBlur(np.roll(pixels, 1, axis=1), (5, 5), 1)
     Image.fromarray(shaken).save(tmp_path / "0002_burst.jpg", quality=95)
     report = estimate_cameras(tmp_path, quiet)
-    assert report.repeated == {"0002_burst.jpg": "0002.jpg", "copy/IMG_7.jpg": "0001.jpg"}
+    assert report.record.repeated == {"0002_burst.jpg": "0002.jpg", "copy/IMG_7.jpg": "0001.jpg"}
     assert report.n_pictures == report.n_registered == 4
     told = "; 0002_burst.jpg and 1 more show what another picture (0002.jpg) does, and are left out"
     assert report.summary().endswith(told)
@@ -481,9 +481,11 @@ def test_of_groups_that_have_nothing_in_common_the_largest_is_taken_and_said(can
         both.paste(far, (0, 0))
         both.save(photos / f"b_{index}.jpg", quality=95)
     report = estimate_cameras(photos, quiet)
-    assert report.n_registered == 8 and set(report.unplaced) == {f"b_{index}.jpg" for index in range(4)}
+    assert report.n_registered == 8 and set(report.record.unplaced) == {
+        f"b_{index}.jpg" for index in range(4)
+    }
     assert estimate_cameras(photos, quiet) == report
     checked = check_data(str(photos), WorkingSize(), 60.0)
-    assert {p.name: p.why for p in checked.pictures if p.found is False} == report.unplaced
-    apart = replace(report, apart=(4,))
+    assert {p.name: p.why for p in checked.pictures if p.found is False} == report.record.unplaced
+    apart = replace(report, record=replace(report.record, apart=(4,)))
     assert apart.summary().endswith("the largest is taken, the other has 4")

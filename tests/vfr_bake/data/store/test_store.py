@@ -16,9 +16,10 @@ from PIL import Image
 from player.cameras.transforms import write_cameras
 from player.errors import OutputError
 from player.files.replace import clear_up
-from vfr_bake.data import PosedImages, load_scene
+from vfr_bake.data import load_scene
 from vfr_bake.data.demo import demo_cameras
 from vfr_bake.data.store import cache, reading, stored
+from vfr_bake.data.store.capture import PosedImages
 from vfr_bake.data.store.reading import PictureReader
 from vfr_bake.data.store.stored import StoredImages, StoreLayout, in_order, map_pictures, write_picture
 from vfr_bake.data.store.working import WorkingSize
