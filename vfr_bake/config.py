@@ -58,34 +58,23 @@ def check(settings: object, name: str, fits: bool, expected: str) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class FieldConfig:
-    """Architecture of a field (section 4 of the paper); stored in the model file."""
+    """Architecture of a field (section 4 of the paper); stored in the model file. `FieldOptions` says what
+    its settings mean."""
 
     unbounded: bool = False
     """Whether the grid covers all of space, contracted, or the box [-1, 1]^3 alone."""
     n_levels: int = 16
-    """Levels of the hash grid."""
     base_resolution: int = 16
-    """Cells per axis of the coarsest level, over the unit cube."""
     max_resolution: int = 512
-    """Cells per axis of the finest level."""
     log2_table_size: int = 20
-    """A level with more vertices than two to this power shares entries by hashing."""
     density_width: int = 64
-    """Hidden width of the density network; 0 for a linear map."""
     compositing: Compositing = "features"
-    """What is summed along a ray: features for one head (equation 3), or the head's colours (equation 2)."""
     head_width: int = 256
-    """Width of every layer of the head, and of its bottleneck."""
     n_directional_layers: int = 4
-    """Layers of the directional MLP behind the two spatial ones."""
     activation: Activation = "gelu"
-    """Between the head's layers."""
     view_encoding: ViewEncoding = "sh-features"
-    """How the head sees the direction: basis functions times predicted features (equation 4), or alone."""
     sh_degree: int = 4
-    """Bands of spherical harmonics in the view encoding: degree 4 means l = 0..3, 16 basis functions."""
     n_sh_features: int = 4
-    """Features that multiply each basis function (equation 4 of the paper)."""
 
     def __post_init__(self) -> None:
         check(self, "n_levels", 1 <= self.n_levels <= 32, "1 to 32")

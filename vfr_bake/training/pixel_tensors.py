@@ -56,8 +56,6 @@ def _check(
     content: Any, keys: dict[str, torch.dtype], most: int, cameras: Sequence[Camera], where: str
 ) -> None:
     """Check that the tensors hold at most `most` pixels of `cameras`; raises FormatError if they do not."""
-    if not isinstance(content, dict):
-        raise FormatError(f"{where}: expected dict, got {type(content).__name__}")
     check_kinds(content, dict.fromkeys(keys, torch.Tensor), where)
     for name, dtype in keys.items():
         numbers = "bytes" if dtype == torch.uint8 else "32-bit integers"

@@ -112,8 +112,11 @@ def check_plain(tensor: torch.Tensor, fits: bool, numbers: str, where: str) -> N
         raise FormatError(f"{where}: expected a plain tensor of {numbers}, got {got}")
 
 
-def check_kinds(content: dict[str, Any], kinds: dict[str, type], where: str) -> None:
-    """Raise FormatError unless the value of each key of `kinds` in `content` is of that kind."""
+def check_kinds(content: Any, kinds: dict[str, type], where: str) -> None:
+    """Raise FormatError unless `content` is a dict, in which the value of each key of `kinds` is of that
+    kind."""
+    if not isinstance(content, dict):
+        raise FormatError(f"{where}: expected dict, got {type(content).__name__}")
     for key, kind in kinds.items():
         if not isinstance(content.get(key), kind):
             raise FormatError(

@@ -59,8 +59,7 @@ def qualities(work: Work, scene: Scene, asset_of: str) -> dict[str, Any]:
     size = work.little(scene.size, "24x24")
     frames = ("--frames", work.little(20, 2), "--numpy-frames", work.little(5, 2))
     words = ("--data", data_of(work, scene), "--views", str(scene.views), "--size", size, *frames)
-    work.command("bench_qualities", work.file(asset_of, "asset"), *words, "--json", work.folder / "play.json")
-    return work.read("play.json")
+    return _script(work, "bench_qualities", work.file(asset_of, "asset"), *words)
 
 
 def exports(work: Work, asset_of: str) -> dict[str, Any]:
@@ -88,8 +87,7 @@ def exports(work: Work, asset_of: str) -> dict[str, Any]:
 def page(work: Work, asset_of: str) -> dict[str, Any]:
     """Measure the page of an asset, in a browser that draws on the processor."""
     little = ("--size", work.little(400, 32), "--views", work.little(3, 1), "--rounds", work.little(3, 1))
-    work.command("bench_page", work.file(asset_of, "asset"), *little, "--json", work.folder / "page.json")
-    return work.read("page.json")
+    return _script(work, "bench_page", work.file(asset_of, "asset"), *little)
 
 
 def viewers(work: Work, scene: Scene, asset_of: str) -> dict[str, Any]:
@@ -119,8 +117,7 @@ def lookups(work: Work, scene: Scene, bakes: dict[str, str]) -> dict[str, Any]:
     """Measure each view's loss by the number of lookups; `bakes`: parts by the names of their columns."""
     assets = [work.file(name, "asset") for name in bakes.values()]
     words = ("--data", data_of(work, scene), "--views", work.little(50, 2), "--samples", *LOOKUPS)
-    work.command("bench_lookups", *assets, *words, "--json", work.folder / "lookups.json")
-    found = work.read("lookups.json")
+    found = _script(work, "bench_lookups", *assets, *words)
     return {name: found[str(asset)] for name, asset in zip(bakes, assets, strict=True)}
 
 

@@ -72,8 +72,6 @@ def restore_colours(content: Any, n_views: int, where: str) -> PictureColours:
 
     Raises FormatError: a tensor is missing or of another kind or shape, or a number is out of range.
     """
-    if not isinstance(content, dict):
-        raise FormatError(f"{where}: expected dict, got {type(content).__name__}")
     check_kinds(content, dict.fromkeys(KEYS, torch.Tensor), where)
     for name, (low, high) in zip(KEYS, (GAINS, OFFSETS), strict=True):
         tensor = content[name]
