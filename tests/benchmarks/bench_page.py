@@ -30,10 +30,9 @@ from player.asset.asset import Asset
 from player.cameras.camera import Camera
 from player.cameras.transforms import read_cameras
 from player.render import Renderer
+from tests.benchmarks.against import QUALITIES
 from tests.player.page.render_page import RenderPage, view_of
 from tests.player.page.viewer_page import chromium
-
-QUALITIES = ("exact", "high", "fast")
 
 OTHERS = {"MERF": (13, 896), "SMERF": (13, 960)}
 """For two other viewers, the work of their shaders (google-research, `merf/webviewer` and `smerf/webviewer`):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+from tests.benchmarks.against import QUALITIES
 from tests.benchmarks.pages.cells import (
     duration,
     give_or_take,
@@ -13,7 +14,7 @@ from tests.benchmarks.pages.cells import (
     titled,
     where,
 )
-from tests.benchmarks.pages.tables import BAKES, QUALITIES, asset_name
+from tests.benchmarks.pages.tables import BAKES, asset_name
 from tests.benchmarks.suite.parts import PAGES, PRESETS
 from tests.benchmarks.suite.results import Results
 from tests.benchmarks.suite.scenes import SCENES

@@ -24,16 +24,16 @@ def table(titles: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
     return [lines[0], f"|{'---|' * len(titles)}", *lines[1:]]
 
 
-def number(value: float | None, digits: int, unit: str = "") -> str:
+def number(value: float | None, digits: int) -> str:
     """Return a number with so many digits behind the point, or "" for None.
 
-    >>> number(1234.56, 1), number(None, 1), number(0.004, 2, " dB")
-    ('1,234.6', '', '0.00 dB')
+    >>> number(1234.56, 1), number(None, 1), number(-0.004, 2)
+    ('1,234.6', '', '0.00')
     """
     if value is None:
         return ""
     text = f"{value:,.{digits}f}"
-    return (text if float(text.replace(",", "")) else text.lstrip("-")) + unit
+    return text if float(text.replace(",", "")) else text.lstrip("-")
 
 
 def give_or_take(value: float | None, uncertainty: float | None, digits: int) -> str:

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from tests.benchmarks.against import QUALITIES
 from tests.benchmarks.pages.cells import (
     Block,
     command,
@@ -30,7 +31,6 @@ from tests.benchmarks.suite.scenes import SCENES, uncertainty_of_mean
 BAKES = [f"bake_{scene}_{preset}" for scene, presets in PRESETS.items() for preset in presets]
 VERSIONS = ("python", "numpy", "numba", "onnxruntime", "torch")
 """Libraries of the results whose versions are shown."""
-QUALITIES = ("exact", "high", "fast")
 
 
 def asset_name(part: str) -> str:
@@ -43,14 +43,13 @@ def asset_name(part: str) -> str:
     return f"{scene}, {what}"
 
 
-def own_setting(results: Results, part: str, quality: str = "exact") -> dict[str, Any] | None:
-    """Return the row of the trade in which a baked asset is played with its own number of lookups."""
+def own_setting(results: Results, part: str) -> dict[str, Any] | None:
+    """Return the row of the trade in which a baked asset is played exactly with its own lookups."""
     rows = [
         row
         for name, result in results.items() if name.startswith("trade_")
-        for row in result["figures"]["settings"] if row["asset"] == part and row["quality"] == quality
+        for row in result["figures"]["settings"] if row["asset"] == part and row["quality"] == "exact"
     ]  # fmt: skip
-    # a quality other than exact may lower the number; it is measured with the asset's own alone
     return max(rows, key=lambda row: row["what"].get("n_fetches") == row["n_fetches"], default=None)
 
 
