@@ -264,7 +264,7 @@ def test_commands_are_found() -> None:
         "vfr-export out/ mesh.gltf",
         "make cofee",
         "pip install '.[gpu]'",
-        "python -m tests.benchmarks.against CHECKOUT out/ --frame",
+        "python tests/benchmarks/bench_play.py out/ --curve",
         "python -m tests.reliability.nothing",
         "vfr-view out/",
     ],

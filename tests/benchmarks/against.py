@@ -1,45 +1,35 @@
 """Compare frames of another version of the player with this one's; each version may play an asset of its own.
 
-    python -m tests.benchmarks.against CHECKOUT lego/ fox/ --march numba numpy --frames 60
-    python -m tests.benchmarks.against CHECKOUT out/ --its-asset ITS_ASSET
-
 The other version and each quality of this one run in processes of their own. They take turns frame by frame,
 so that other work of the machine affects all of them alike. The views are a walk through some training views
 and a slow turn around the scene. Ratios are medians over the frames, of elapsed time and of processor time;
 on a machine that does other work, trust the second. Pictures are compared with the exact ones of the same
 asset: the error of pictures, and the error of the difference between each picture and the one before it,
-which measures flicker. Linux alone.
+which measures flicker.
 """
 
 from __future__ import annotations
 
-import argparse
-import itertools
 import json
 import os
 import subprocess
 import sys
-from contextlib import ExitStack
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 
-from player.app.option_types import positive, size
 from player.asset.asset import Asset
 from player.cameras.camera import Camera, orbit
 from player.cameras.keyframes import smooth_path
 from player.cameras.views import asset_cameras
-from player.threads import default_threads
-from tests.benchmarks.suite.conditions import REPOSITORY
 
 QUALITIES = ("exact", "high", "fast")
 TURN = 240
 """Number of views in a whole turn; a slow turn shows only the first of them."""
 
 _WORKER = """
-import json, sys, time
+import json, resource, sys, time
 import numpy as np
 from pathlib import Path
 try:
@@ -50,9 +40,12 @@ except ImportError:  # a version whose modules all lie in one folder
     from player.cameras import Camera
 from player.render import Renderer
 folder, threads, march, quality, picture = sys.argv[1:]
-def peak_mb():  # not ru_maxrss, which a process inherits from the one that started it
-    with open("/proc/self/status") as status:
-        return next(int(line.split()[1]) for line in status if line.startswith("VmHWM")) / 1024
+def peak_mb():
+    try:  # a process inherits ru_maxrss from the one that started it
+        with open("/proc/self/status") as status:
+            return next(int(line.split()[1]) for line in status if line.startswith("VmHWM")) / 1024
+    except OSError:
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 renderer = Renderer(Asset.open(Path(folder)), int(threads), march)
 settings = {} if quality == "exact" else {"quality": quality}
 for line in sys.stdin:
@@ -67,28 +60,29 @@ for line in sys.stdin:
 
 
 class Player:
-    """A process that renders with one version of the player; a context manager."""
+    """A process that renders with one version of the player."""
 
-    def __init__(self, checkout: Path, folder: Path, threads: int, march: str, quality: str) -> None:
-        self._checkout, self._scratch = checkout, TemporaryDirectory(prefix="vfr-bench-")
-        self._picture = Path(self._scratch.name) / "picture.npy"
-        settings = (str(folder.resolve()), str(threads), march, quality, str(self._picture))
+    def __init__(
+        self, checkout: Path, folder: Path, threads: int, march: str, quality: str, picture: Path
+    ) -> None:
+        self._checkout, self._picture = checkout, picture
         self._process = subprocess.Popen(
-            [sys.executable, "-c", _WORKER, *settings],
+            [
+                sys.executable,
+                "-c",
+                _WORKER,
+                str(folder.resolve()),
+                str(threads),
+                march,
+                quality,
+                str(picture),
+            ],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,
             cwd=checkout,
             env=os.environ | {"PYTHONPATH": str(checkout.resolve()), "OPENBLAS_NUM_THREADS": "1"},
         )
-
-    def __enter__(self) -> Player:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._process.kill()
-        self._process.communicate()
-        self._scratch.cleanup()
 
     def frame(self, camera: Camera) -> tuple[list[float], np.ndarray]:
         """Return (seconds, seconds of processor time, peak megabytes), and the picture [h, w, 3] in 0..1."""
@@ -101,6 +95,10 @@ class Player:
             raise SystemExit(f"{self._checkout}: expected a picture, got an end: see what it has said above")
         return json.loads(answer), np.load(self._picture) / 255
 
+    def close(self) -> None:
+        self._process.kill()
+        self._process.communicate()
+
 
 def views(asset: Asset, size: tuple[int, int], n_frames: int) -> list[Camera]:
     """Return views, half of them on a walk between training views, and half on a slow turn."""
@@ -111,20 +109,33 @@ def views(asset: Asset, size: tuple[int, int], n_frames: int) -> list[Camera]:
 
 
 def compare(
-    folder: Path, other: tuple[Path, Path], size: tuple[int, int], n_frames: int, threads: int, march: str
+    folder: Path,
+    other: tuple[Path, Path],
+    size: tuple[int, int],
+    n_frames: int,
+    threads: int,
+    march: str,
+    scratch: Path,
 ) -> list[dict[str, Any]]:
     """Return a row for the other version (`other`: its checkout and its asset), and for each quality of this
-    one."""
-    kinds = [(*other, "exact"), *((REPOSITORY, folder, quality) for quality in QUALITIES)]
-    with ExitStack() as stack:
-        players = [
-            stack.enter_context(Player(checkout, asset, threads, march, quality))
-            for checkout, asset, quality in kinds
-        ]
+    one.
+
+    Pictures are written to the folder `scratch` meanwhile.
+    """  # fmt: skip
+    here = Path(__file__).parents[2]
+    kinds = [(other[0], other[1], "exact"), *((here, folder, quality) for quality in QUALITIES)]
+    players = [
+        Player(*kind[:2], threads, march, kind[2], scratch / f"{number}.npy")
+        for number, kind in enumerate(kinds)
+    ]
+    try:
         cameras = views(Asset.open(folder), size, n_frames)
         for player in players:
             player.frame(cameras[0])
         found = [[player.frame(camera) for player in players] for camera in cameras]
+    finally:
+        for player in players:
+            player.close()
     times = np.array([[figures for figures, _ in frames] for frames in found])
     rows = []
     for number, (_, asset, quality) in enumerate(kinds):
@@ -157,29 +168,3 @@ def lines(rows: list[dict[str, Any]]) -> list[str]:
 
 def _psnr(errors: np.ndarray) -> float:
     return float(-10 * np.log10(max(np.mean(np.square(errors)), 1e-12)))
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("checkout", type=Path, help="of the other version")
-    parser.add_argument("assets", type=Path, nargs="+")
-    parser.add_argument(
-        "--its-asset", type=Path, help="asset of the other version, if it is not the same one"
-    )
-    parser.add_argument("--march", choices=("numba", "numpy"), nargs="+", default=["numba"])
-    parser.add_argument("--size", type=size, help="else 800x800, or that of a capture's training pictures")
-    parser.add_argument("--frames", type=positive, default=8)
-    parser.add_argument("--threads", type=positive, default=default_threads())
-    options = parser.parse_args()
-    for folder, march in itertools.product(options.assets, options.march):
-        manifest = Asset.open(folder).manifest
-        width, height = options.size or (manifest.view_size if manifest.contracted else (800, 800))
-        other = options.checkout, options.its_asset or folder
-        rows = compare(folder, other, (width, height), options.frames, options.threads, march)
-        what = f"{folder}, {width}x{height}, {march}, {options.threads} threads, {options.frames} frames"
-        print(f"\n{what}, load {os.getloadavg()[0]:.1f}\n")
-        print("\n".join(lines(rows)), flush=True)
-
-
-if __name__ == "__main__":
-    main()

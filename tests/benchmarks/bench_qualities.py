@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import tempfile
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -23,23 +24,24 @@ from player.asset.asset import Asset
 from player.threads import default_threads
 from tests.benchmarks.against import QUALITIES, Player, views
 from tests.benchmarks.bench_specks import test_views
-from tests.benchmarks.suite.conditions import REPOSITORY
 from vfr_bake.bench.timing import notch
-from vfr_bake.data.scene import evenly
 from vfr_bake.training.scores.metrics import psnr
+
+HERE = Path(__file__).parents[2]
 
 
 def frame_times(
-    folder: Path, frame_size: tuple[int, int], n_frames: dict[str, int], threads: int
+    folder: Path, frame_size: tuple[int, int], n_frames: dict[str, int], threads: int, scratch: Path
 ) -> list[dict[str, Any]]:
     """Return a row for each march, of which so many frames are timed, and each quality."""
     rows = []
     with ExitStack() as stack:
-        players = {
-            (march, quality): stack.enter_context(Player(REPOSITORY, folder, threads, march, quality))
-            for march in n_frames
-            for quality in QUALITIES
-        }
+        players = {}
+        for march in n_frames:
+            for quality in QUALITIES:
+                player = Player(HERE, folder, threads, march, quality, scratch / f"{march}_{quality}.npy")
+                stack.callback(player.close)
+                players[march, quality] = player
         cameras = views(Asset.open(folder), frame_size, max(n_frames.values()))
         for player in players.values():
             player.frame(cameras[0])
@@ -63,15 +65,20 @@ def frame_times(
     return rows
 
 
-def losses(folder: Path, data: Path, n_views: int, threads: int) -> dict[str, dict[str, float]]:
+def losses(
+    folder: Path, data: Path, n_views: int, threads: int, scratch: Path
+) -> dict[str, dict[str, float]]:
     """Return the loss of each quality but exact, compared with photographs, and exact's PSNR."""
     asset = Asset.open(folder)
     cameras, photographs = test_views(asset, data)
-    chosen = evenly(len(cameras), n_views)
+    chosen = np.linspace(0, len(cameras) - 1, min(n_views, len(cameras))).round().astype(int)
     scores = {}
     for quality in QUALITIES:
-        with Player(REPOSITORY, folder, threads, "numba", quality) as player:
+        player = Player(HERE, folder, threads, "numba", quality, scratch / f"{quality}.npy")
+        try:
             scores[quality] = np.array([psnr(player.frame(cameras[i])[1], photographs[i]) for i in chosen])
+        finally:
+            player.close()
     return {
         quality: {
             "psnr": float(some.mean()),
@@ -94,8 +101,9 @@ def main() -> None:
     parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()
     n_frames = {"numba": arguments.frames, "numpy": arguments.numpy_frames}
-    rows = frame_times(arguments.asset, arguments.size, n_frames, arguments.threads)
-    lost = losses(arguments.asset, arguments.data, arguments.views, arguments.threads)
+    with tempfile.TemporaryDirectory(prefix="vfr-bench-") as scratch:
+        rows = frame_times(arguments.asset, arguments.size, n_frames, arguments.threads, Path(scratch))
+        lost = losses(arguments.asset, arguments.data, arguments.views, arguments.threads, Path(scratch))
     for row in rows:
         some = lost[row["quality"]]
         print(

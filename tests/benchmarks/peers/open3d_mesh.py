@@ -14,6 +14,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import tempfile
 import time
 from contextlib import ExitStack
 from pathlib import Path
@@ -29,10 +30,10 @@ from player.cameras.rotations import OPENGL_FROM_OPENCV
 from player.threads import default_threads
 from tests.benchmarks.against import QUALITIES, Player, views
 from tests.benchmarks.bench_specks import test_views
-from tests.benchmarks.suite.conditions import REPOSITORY
 from vfr_bake.bench.timing import notch
-from vfr_bake.data.scene import evenly
 from vfr_bake.training.scores.metrics import psnr
+
+HERE = Path(__file__).parents[3]
 
 
 def draw_on_the_processor() -> None:
@@ -100,13 +101,16 @@ def measure(
     asset = Asset.open(folder)
     drawer = MeshDrawer(mesh, np.array(asset.manifest.background))
     cameras, photographs = test_views(asset, data)
-    chosen = evenly(len(cameras), n_views)
+    chosen = np.linspace(0, len(cameras) - 1, min(n_views, len(cameras))).round().astype(int)
     with ExitStack() as stack:
+        scratch = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="vfr-bench-")))
         stack.callback(drawer.close)
         drawers: dict[str, MeshDrawer | Player] = {"Open3D, mesh": drawer}
         for quality in QUALITIES:
-            player = Player(REPOSITORY, folder, default_threads(), "numba", quality)
-            drawers[f"vfr-play, {quality}"] = stack.enter_context(player)
+            picture = scratch / f"{quality}.npy"
+            player = Player(HERE, folder, default_threads(), "numba", quality, picture)
+            stack.callback(player.close)
+            drawers[f"vfr-play, {quality}"] = player
         path = views(asset, frame_size, n_frames)
         for some in drawers.values():
             some.frame(path[0])
