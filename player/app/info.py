@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Sequence
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -17,12 +18,6 @@ from player.cameras.views import asset_cameras
 from player.head.head import asset_head
 from player.march.contracted import MAX_SPEED
 from player.terminal import command_line, printable
-
-MANIFEST_KEYS = (
-    "version", "generator", "resolution", "feature_resolution", "aabb", "world_from_model", "contracted",
-    "near", "step", "level_steps", "n_fetches", "agreement", "quality_fetches", "density_range",
-    "density_steps", "n_channels", "feature_steps", "background", "colour_space", "view_size", "provenance",
-)  # fmt: skip
 
 CONTENT = {
     "features.codes": "what the head is given",
@@ -55,7 +50,7 @@ def facts(asset: Asset) -> dict[str, Any]:
         "n_cameras": len(asset_cameras(asset)),
         "world_box": _world_box(asset),
         "world_units_per_model_unit": asset.scale,
-        **{key: getattr(m, key) for key in MANIFEST_KEYS},
+        **{field.name: getattr(m, field.name) for field in fields(m) if field.name not in ("parts", "files")},
     }
 
 

@@ -170,31 +170,17 @@ MODES = {
 """The modes of `vfr-play`, in words."""
 
 _FILES = ("files",)
-_RENDERS = ("viewer", "files")
 USED_BY = {
     "others": ("viewer",),
-    "cameras": _FILES,
-    "orbit": _FILES,
-    "view": _FILES,
+    **dict.fromkeys(("cameras", "orbit", "view"), _FILES),
     "info": ("info",),
     "check": ("check",),
-    "output": _FILES,
-    "format": _FILES,
-    "frames": _FILES,
-    "fps": _FILES,
-    "resume": _FILES,
-    "force": _FILES,
+    **dict.fromkeys(("output", "format", "frames", "fps", "resume", "force"), _FILES),
     "json": ("files", "info", "check"),
-    "dask": _FILES,
-    "size": _FILES,
-    "background": _RENDERS,
-    "samples": _RENDERS,
-    "quality": _RENDERS,
-    "threads": _RENDERS,
-    "march": _RENDERS,
+    **dict.fromkeys(("dask", "size"), _FILES),
+    **dict.fromkeys(("background", "samples", "quality", "threads", "march"), ("viewer", "files")),
     "max_memory": tuple(MODES),
-    "host": ("viewer",),
-    "port": ("viewer",),
+    **dict.fromkeys(("host", "port"), ("viewer",)),
 }
 """The modes in which each option has an effect."""
 

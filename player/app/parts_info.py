@@ -61,18 +61,14 @@ def what_it_adds(part: Part) -> str:
     for grid in ("densities", "features"):
         found = [section for section in part.sections if section.grid == grid]
         symbols = [section for section in found if section.kind == "symbols"]
-        words = _of_densities(symbols) if grid == "densities" else _of_features(symbols)
         filled = {section.level for section in symbols}
+        words = _of_features(symbols) if grid == "features" else [_levels(list(filled))] if filled else []
         bare = [s.level for s in found if s.kind == "structure" and s.level not in filled]
         if bare:
             words.append(f"where {_levels(bare)} {'is' if len(bare) == 1 else 'are'}")
         if words:
             told.append(f"{grid}: {'; '.join(words)}")
     return ". ".join(told)
-
-
-def _of_densities(symbols: Sequence[Section]) -> list[str]:
-    return [_levels([section.level for section in symbols])] if symbols else []
 
 
 def _of_features(symbols: Sequence[Section]) -> list[str]:

@@ -83,7 +83,6 @@ class Window:
         self._views: list[Camera] = []
         self._changed = threading.Condition()
         self._version = 0
-        self._moved = 0.0
         self._closed = False
         self._thread = threading.Thread(target=self._run, name=f"vfr-view-{client.client_id}", daemon=True)
         own = self._renderer.asset.manifest
@@ -110,13 +109,12 @@ class Window:
         """Note that something has changed, so that the picture on the screen is out of date."""
         with self._changed:
             self._version += 1
-            self._moved = time.monotonic()
             self._changed.notify()
 
     # --- controls ---
 
     def _add_controls(self, samples: int, quality: str, background: Any) -> None:
-        from player.viewer.messages import colour, one_of
+        from player.viewer.messages import colour, one_of, pressed, within
 
         gui = self._client.gui
         with gui.add_folder("Picture"):
@@ -168,18 +166,10 @@ class Window:
         self._takes(self._layer, one_of(LAYERS))
         self._takes(self._quality, one_of(QUALITIES))
         self._takes(self._background, colour)
-        self._let_use(
-            sliders=(self._samples, self._fov, self._view, self._seconds),
-            buttons=(jump, picture, record, self._save, self._clear),
-        )
-
-    def _let_use(self, sliders: Sequence[Any], buttons: Sequence[Any]) -> None:
-        from player.viewer.messages import pressed, within
-
-        for slider in sliders:
+        for slider in (self._samples, self._fov, self._view, self._seconds):
             whole = isinstance(slider.value, int)
             self._takes(slider, within(lambda slider=slider: (slider.min, slider.max), whole))
-        for button in buttons:
+        for button in (jump, picture, record, self._save, self._clear):
             self._takes(button, pressed)
 
     def _takes(self, control: Any, check: Check) -> None:
