@@ -10,11 +10,11 @@ from pathlib import Path
 from typing import Any, Literal
 
 from player.asset.asset import Asset
+from player.asset.manifest import NAME
 from player.asset.target import asset_files
 from player.errors import ParityError
 from player.files.files import new_folder, write_bytes
 from player.page.page import INDEX, MAX_GPU_MB, is_site_file, page_of_many_files, page_of_one_file
-from player.page.scene_files import MANIFEST
 from player.page.text_bytes import bytes_of_text
 
 
@@ -68,7 +68,7 @@ def files_in_page(page: bytes) -> dict[str, bytes]:
     found = {}
     for name, text in re.findall(rb'<script[^>]* data-file="([^"]*)"[^>]*>([^<]*)</script>', page):
         try:
-            found[name.decode()] = text if name.decode() == MANIFEST else bytes_of_text(text)
+            found[name.decode()] = text if name.decode() == NAME else bytes_of_text(text)
         except ValueError as error:
             raise ParityError(f"{name.decode()}: {error}") from error
     return found
@@ -76,7 +76,7 @@ def files_in_page(page: bytes) -> dict[str, bytes]:
 
 def _check_data(files: dict[str, bytes], where: str) -> None:
     """Raise ParityError unless every file of the scene has the SHA-256 that the scene's manifest gives."""
-    for name, entry in json.loads(files[MANIFEST])["files"].items():
+    for name, entry in json.loads(files[NAME])["files"].items():
         digest = hashlib.sha256(files.get(name, b"")[: entry["bytes"]]).hexdigest()
         if digest != entry["sha256"]:
             raise ParityError(f"{where}: {name}: expected sha256 {entry['sha256']}, read back {digest}")

@@ -454,9 +454,7 @@ def import_ahead(scipy: bool = True) -> None:
     threading.Thread(target=imports, daemon=True).start()
 
 
-@lru_cache(maxsize=2)
-def _renderer(asset: Asset, n_threads: int | None, march: March) -> Renderer:
-    return Renderer(asset, n_threads, march)
+_renderer = lru_cache(maxsize=2)(Renderer)
 
 
 def render(

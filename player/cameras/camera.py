@@ -193,7 +193,9 @@ def focus_point(cameras: Sequence[Camera]) -> np.ndarray:
     >>> bool(np.allclose(focus_point(cameras), 0, atol=1e-4))
     True
     """
-    origins, forwards = _axes(cameras)
+    c2w = np.stack([camera.c2w for camera in cameras])
+    origins = c2w[:, :3, 3]
+    forwards = -c2w[:, :3, 2] / np.linalg.norm(c2w[:, :3, 2], axis=-1, keepdims=True)
     middle = origins.mean(axis=0)
     spread = float(np.sqrt(((origins - middle) ** 2).sum(axis=-1).mean()))
     # Positions are in units of the cameras' spread around their mean, so that the solution does not depend on
@@ -251,12 +253,6 @@ def orbit(cameras: Sequence[Camera], n_frames: int, size: tuple[int, int] | None
         c2w[:3, :4] = np.stack([right, np.cross(back, right), back, focus + radius * back], axis=-1)
         views.append(replace(first, name=f"orbit_{index:0{n_digits}d}", c2w=c2w))
     return views
-
-
-def _axes(cameras: Sequence[Camera]) -> tuple[np.ndarray, np.ndarray]:
-    """Return positions and viewing directions, [n_cameras, 3] each."""
-    c2w = np.stack([camera.c2w for camera in cameras])
-    return c2w[:, :3, 3], -c2w[:, :3, 2] / np.linalg.norm(c2w[:, :3, 2], axis=-1, keepdims=True)
 
 
 def world_up(cameras: Sequence[Camera]) -> np.ndarray:

@@ -36,11 +36,12 @@ from importlib import resources
 from typing import NamedTuple
 
 from player.asset.asset import Asset
+from player.asset.manifest import NAME
 from player.errors import ConfigError
 from player.page.gpu_memory import MOST_CHANNELS, MOST_DECODING_BYTES, decoding_bytes, gpu_bytes
 from player.page.modules import joined, without_comments
 from player.page.poster import poster_bytes
-from player.page.scene_files import MANIFEST, scene_files
+from player.page.scene_files import scene_files
 from player.page.text_bytes import text_of_bytes
 from player.render import March
 
@@ -150,7 +151,7 @@ def _around_data(
     )
     viewer = text_of_bytes(packed).decode()
     filled = {
-        "policy": _policy_element(policy),
+        "policy": f'<meta http-equiv="Content-Security-Policy" content="{policy}">',
         "title": html.escape(asset.folder.resolve().name if title is None else title),
         "style": f"<style>{style}</style>",
         "poster": poster,
@@ -158,7 +159,8 @@ def _around_data(
         "script": f'<script type="module">{boot}</script>',
         "viewer": f'<script type="text/plain" id="viewer" data-bytes="{len(packed)}">{viewer}</script>',
     }
-    before, behind = (_ascii_html(_filled(half, filled)) for half in sources[INDEX].split("{{data}}"))
+    halves = (_filled(half, filled) for half in sources[INDEX].split("{{data}}"))
+    before, behind = (half.encode("ascii", "xmlcharrefreplace") for half in halves)
     return before, behind
 
 
@@ -216,11 +218,11 @@ def web_files() -> dict[str, str]:
 def data_elements(files: Mapping[str, bytes]) -> bytes:
     """Make the elements of a page that hold the files of `scene_files`."""
     texts = {
-        name: data.replace(b"<", b"\\u003c") if name == MANIFEST else text_of_bytes(data)
+        name: data.replace(b"<", b"\\u003c") if name == NAME else text_of_bytes(data)
         for name, data in files.items()
     }
-    digest = hashlib.sha256(texts[MANIFEST]).hexdigest()
-    attributes = {MANIFEST: f' data-sha256="{digest}"'.encode()}
+    digest = hashlib.sha256(texts[NAME]).hexdigest()
+    attributes = {NAME: f' data-sha256="{digest}"'.encode()}
     return b"".join(
         b'<script type="text/plain" data-file="%s"%s>%s</script>\n'
         % (name.encode(), attributes.get(name, b""), text)
@@ -247,17 +249,9 @@ def _escaped_style(style: str) -> str:
     return "".join(letter if letter.isascii() else f"\\{ord(letter):x} " for letter in style)
 
 
-def _ascii_html(text: str) -> bytes:
-    return text.encode("ascii", "xmlcharrefreplace")
-
-
 def _hash(text: str) -> str:
     """Return the hash by which a Content-Security-Policy names an element with this text."""
     return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
-
-
-def _policy_element(policy: str) -> str:
-    return f'<meta http-equiv="Content-Security-Policy" content="{policy}">'
 
 
 def _filled(index: str, values: Mapping[str, str]) -> str:

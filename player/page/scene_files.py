@@ -24,8 +24,6 @@ from player.errors import FormatError
 from player.head.head import asset_head
 from player.page.head_data import head_data
 
-MANIFEST = NAME
-
 
 def scene_files(asset: Asset) -> dict[str, bytes]:
     """Make the data of a page, in the order in which its files are asked for.
@@ -52,7 +50,7 @@ def scene_files(asset: Asset) -> dict[str, bytes]:
     entries = {name: file_entry(data) for name, data in files.items()}
     document = manifest_bytes(replace(manifest, version=VERSION, files=entries, provenance={}))
     compact = json.dumps(json.loads(document), separators=(",", ":")).encode()
-    return {MANIFEST: compact, **files}
+    return {NAME: compact, **files}
 
 
 def _cameras(asset: Asset) -> bytes:
