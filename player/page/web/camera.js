@@ -4,10 +4,9 @@
 // direction of the ray through (px, py). If the camera is far away, (px, py) is where the middle of the box is seen, and
 // rays begin beside the box: so float32 still resolves the differences between the pixels of the box.
 
-const FAR_AWAY = 64; // distance beyond which a camera is far away, in half diagonals of the box
+import { add, column, dot } from "./pose.js";
 
-const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
-const sum = (a, s, b) => [a[0] + s * b[0], a[1] + s * b[1], a[2] + s * b[2]];
+const FAR_AWAY = 64; // distance beyond which a camera is far away, in half diagonals of the box
 
 // Take a similarity [4][4] apart, x -> scale rotation x + move: { rotation [3][3], scale, move [3] }.
 function similarity(matrix) {
@@ -19,22 +18,21 @@ function similarity(matrix) {
 export function raysOf(view, manifest) {
   const { scale, rotation, move } = similarity(manifest.world_from_model);
   const turn = (v) => [0, 1, 2].map((i) => rotation[0][i] * v[0] + rotation[1][i] * v[1] + rotation[2][i] * v[2]);
-  const column = (i) => [view.c2w[i], view.c2w[4 + i], view.c2w[8 + i]];
-  const [right, up, back] = [0, 1, 2].map((i) => turn(column(i)));
-  const eye = turn(sum(column(3), -1, move)).map((x) => x / scale);
+  const [right, up, back] = [0, 1, 2].map((i) => turn(column(view.c2w, i)));
+  const eye = turn(add(column(view.c2w, 3), move, -1)).map((x) => x / scale);
   const [low, high] = manifest.aabb;
   const middle = low.map((x, i) => (x + high[i]) / 2), radius = Math.hypot(...low.map((x, i) => high[i] - x)) / 2;
-  const way = sum(middle, -1, eye), distance = Math.hypot(...way);
+  const way = add(middle, eye, -1), distance = Math.hypot(...way);
   const start = distance > FAR_AWAY * radius ? distance - radius : 0;
   const ahead = -dot(way, back);
   let pixel = [view.cx, view.cy];
   if (start && ahead > 0.01 * distance) {
     pixel = [view.cx + (view.fx * dot(way, right)) / ahead, view.cy - (view.fy * dot(way, up)) / ahead];
   }
-  const centre = sum(sum(back.map((x) => -x), (pixel[0] - view.cx) / view.fx, right), -(pixel[1] - view.cy) / view.fy, up);
+  const centre = add(add(back.map((x) => -x), right, (pixel[0] - view.cx) / view.fx), up, -(pixel[1] - view.cy) / view.fy);
   const norm = Math.hypot(...centre), unit = centre.map((x) => x / norm);
   return {
-    uOrigin: sum(eye, start, unit), uStart: start, uCentre: unit, uPixel: pixel,
+    uOrigin: add(eye, unit, start), uStart: start, uCentre: unit, uPixel: pixel,
     uAcross: right.map((x) => x / (view.fx * norm)), uDown: up.map((x) => -x / (view.fy * norm)),
     uScale: scale, uDepths: [Math.max(distance - radius, 0) * scale, (distance + radius) * scale],
     uWorldFromModel: [0, 1, 2].flatMap((i) => rotation.map((row) => row[i])),

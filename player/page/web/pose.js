@@ -14,7 +14,7 @@
 //
 // Cameras' matrices c2w are 16 numbers, row by row, OpenGL axes: x right, y up, and the camera looks along -z.
 
-const add = (a, b, scale = 1) => a.map((value, i) => value + scale * b[i]);
+export const add = (a, b, scale = 1) => a.map((value, i) => value + scale * b[i]);
 export const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 export const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
 export const column = (c2w, i) => [c2w[i], c2w[i + 4], c2w[i + 8]];

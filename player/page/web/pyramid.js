@@ -175,8 +175,8 @@ for (let b = 0; b < 512; b++) {
   for (let k = 0; k < 8; k++) {
     places.add(25 * ((x + (k >> 2)) >> 1) + 5 * ((y + ((k >> 1) & 1)) >> 1) + ((z + (k & 1)) >> 1));
   }
-  [...places, ...places, ...places, ...places, ...places, ...places, ...places, ...places].slice(0, 8)
-    .forEach((place, k) => { AROUND[8 * b + k] = place; });
+  const different = [...places];
+  for (let k = 0; k < 8; k++) AROUND[8 * b + k] = different[k % different.length];
 }
 
 // Compute the values of some channels of a level, `clip(predicted + step * symbol)`, into `values`.
