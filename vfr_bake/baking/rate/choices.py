@@ -21,8 +21,9 @@ from vfr_bake.baking.detail.shown import Wanted
 from vfr_bake.baking.grids import codes
 from vfr_bake.kernels.symbols import choose
 
-TURNS = 2
-"""Times that a level's symbols are chosen, each time with the bit costs that follow from the last choice."""
+FIRST_TURNS = 2
+"""Times that a level's symbols are chosen at the first price, each time with the bit costs that follow from
+the last choice. At other prices they are chosen once, with the costs that followed from the price before."""
 STRENGTH = 16.0
 """Weight of the statistics of all contexts in those of a single context, as a number of symbols: a context
 with this many symbols of its own weighs both alike."""
@@ -68,6 +69,8 @@ class Choices:
         vertices = wanted.pyramid.vertices
         self._places = [places_between(*two) for two in pairwise(vertices)]
         self._rows = [_all_rows(level_rows(of_level)) for of_level in vertices]
+        self._bits: dict[tuple[int, int], np.ndarray] = {}
+        """The bits of symbols (`bits_of`) that followed from the last choice, by channel and level."""
 
     def at(self, price: float) -> ChosenValues:
         """Choose the values to store if saving a bit is worth a mean square error of `price`."""
@@ -100,14 +103,17 @@ class Choices:
             inside = ~vertices.on_border  # vertices on the border have no symbols
             wanted = np.clip(codes(self._wanted[level][inside, number]), *self._limits)
             weights, near = self._weights[level][inside] * factor, np.zeros(len(wanted) + 1, np.int16)
-            values, cost = np.empty(len(wanted), np.int16), first_bits()
-            for _ in range(TURNS):
+            values, cost = np.empty(len(wanted), np.int16), self._bits.get((number, level))
+            turns = FIRST_TURNS if cost is None else 1
+            cost = first_bits() if cost is None else cost
+            for _ in range(turns):
                 seen = np.zeros(cost.shape, np.int64)
                 weighed, _ = choose(
                     wanted, predicted[inside], weights, neighbours, classes, cost, CONTEXT_OF_SUM, MIXED,
                     (self._step, *self._limits), near, values, seen,
                 )  # fmt: skip
                 cost = bits_of(seen)
+            self._bits[number, level] = cost
             distortion, bits = weighed * price, bits + float((seen * cost).sum())
             predicted[inside] = values
             out[level][:] = predicted
