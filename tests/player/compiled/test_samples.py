@@ -1,4 +1,4 @@
-"""Tests of compiled code that returns every sample of rays, against the march in numpy."""
+"""Tests of compiled code that returns every sample or fetch of rays, against the march in numpy."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import pytest
 from player.asset.grid import SparseGrid
 from player.compiled import samples as compiled
 from player.march import march
+from player.march.fetches import MIN_TOTAL, Samples, equal_mass_bins, heaviest, stored_features
 from tests.player.march.contracted_scene import contracted_grid
 from tests.player.march.pyramid_scene import random_scene, sparse_scene
 from tests.player.march.test_contracted_march import bumps, shells
@@ -76,4 +77,53 @@ def test_any_number_of_threads_finds_the_same(name: str, n_rays: int) -> None:
     for n_threads in (2, 3, 7):
         found = compiled.sample_rays(grid, rays_o[:n_rays], rays_d[:n_rays], n_threads)
         for a, b in zip((*found.samples, *found[1:]), (*alone.samples, *alone[1:]), strict=True):
+            assert a.dtype == b.dtype and a.tobytes() == b.tobytes()
+
+
+def expected_fetches(
+    grid: SparseGrid, rays_o: np.ndarray, rays_d: np.ndarray, k: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the ray [n_fetches], the place [n_fetches, 3] and the weight [n_fetches] of each fetch, ray by
+    ray, by the functions that define them."""
+    path, samples, _, tau, _ = march.sample_rays(grid, rays_o, rays_d)
+    opacity = -np.expm1(-tau)
+    hit = opacity > march.MIN_OPACITY
+    cut = np.bincount(samples.ray, minlength=len(tau))[samples.ray] > k
+    own = Samples(*(column[hit[samples.ray] & ~cut] for column in samples))
+    merged = Samples(*(column[hit[samples.ray] & cut] for column in samples))
+    bins = equal_mass_bins(merged, k)
+    gaps = np.flatnonzero(stored_features(grid, path.at(bins.ray, bins.s))[1] < MIN_TOTAL)
+    s = bins.s.copy()
+    s[gaps] = merged.s[heaviest(bins, gaps)]
+    ray = np.concatenate([own.ray, bins.ray])
+    weights = np.concatenate([own.weights, opacity[bins.ray] / np.float32(k)])
+    order = np.argsort(ray, kind="stable")
+    at = path.at(ray, np.concatenate([own.s, s])).T
+    return ray[order], at[order], weights[order]
+
+
+@pytest.mark.parametrize("k", [1, 3, 12])
+@pytest.mark.parametrize("name", GRIDS)
+def test_fetches_are_those_of_the_definition(name: str, k: int) -> None:
+    grid, (rays_o, rays_d) = GRIDS[name](), rays(1000, seed=4)
+    ray, at, weights = expected_fetches(grid, rays_o, rays_d, k)
+    found = compiled.fetch_places(grid, rays_o, rays_d, k, n_threads=2)
+    # Rays of which cosines or optical depths are rounded differently may have other samples.
+    n = np.stack([np.bincount(rays_of, minlength=1000) for rays_of in (ray, found.ray)])
+    same = n[0] == n[1]
+    assert (~same).sum() <= 5 and n.max() == k and (n.max(axis=1) == k).all()
+    kept, of_found = same[ray], same[found.ray]
+    np.testing.assert_allclose(found.weights[of_found], weights[kept], rtol=2e-4, atol=1e-6)
+    far = np.abs(found.points[of_found] - at[kept]).max(axis=1) > 2e-3 * grid.resolution
+    assert far.mean() < 1e-3, "but where sums of float32 decide whether a bin has a stored place"
+    assert (np.diff(found.ray) >= 0).all()
+
+
+@pytest.mark.parametrize("n_rays", [0, 1, 17, 1000])
+def test_any_number_of_threads_finds_the_same_fetches(n_rays: int) -> None:
+    grid, (rays_o, rays_d) = GRIDS["haze"](), rays(1000, seed=3)
+    alone = compiled.fetch_places(grid, rays_o[:n_rays], rays_d[:n_rays], 4)
+    for n_threads in (2, 3, 7):
+        found = compiled.fetch_places(grid, rays_o[:n_rays], rays_d[:n_rays], 4, n_threads)
+        for a, b in zip(found, alone, strict=True):
             assert a.dtype == b.dtype and a.tobytes() == b.tobytes()
