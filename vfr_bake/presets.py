@@ -49,8 +49,8 @@ class BakeChoice:
     head_bits: int
     """Bits of the head's wide layers, 8 or 32."""
     refine_steps: int
-    """Steps of refinement before the lookups and bits are chosen that are played; two thirds as many follow
-    with these."""
+    """Most steps of refinement before the lookups and bits are chosen that are played; two thirds as many as
+    are taken follow with these."""
     minutes: float = 8
     """Wall-clock minutes of a bake, roughly: refinement takes fewer steps if the machine is too slow for all
     of them, unless their number was asked for."""
@@ -68,7 +68,7 @@ class BakeChoice:
 PRESETS: dict[Preset, BakeChoice] = {
     "fidelity": BakeChoice(
         preset="fidelity",
-        cells_per_pixel=1.95, contracted_resolution=1536, feature_share=0.68, culled_loss_db=0.02,
+        cells_per_pixel=1.95, contracted_resolution=1536, feature_share=0.68, culled_loss_db=0.01,
         n_channels=22, channel_loss_db=0.03, n_fetches=16, sample_loss_db=0.005,
         code_loss_db=0.02, density_step=2, code_levels=127, head_width=0, head_layers=3,
         head_bands=4, head_bits=8, refine_steps=1200, mesh_resolution=128, target_loss_db=0.05,
@@ -76,7 +76,7 @@ PRESETS: dict[Preset, BakeChoice] = {
     ),
     "balanced": BakeChoice(
         preset="balanced",
-        cells_per_pixel=1.65, contracted_resolution=1408, feature_share=0.775, culled_loss_db=0.06,
+        cells_per_pixel=1.65, contracted_resolution=1408, feature_share=0.775, culled_loss_db=0.02,
         n_channels=16, channel_loss_db=0.15, n_fetches=12, sample_loss_db=0.05,
         code_loss_db=0.13, density_step=4, code_levels=50, head_width=64, head_layers=3,
         head_bands=4, head_bits=8, refine_steps=3000, mesh_resolution=128, target_loss_db=0.4,
@@ -84,7 +84,7 @@ PRESETS: dict[Preset, BakeChoice] = {
     ),
     "fast": BakeChoice(
         preset="fast",
-        cells_per_pixel=1.55, contracted_resolution=640, feature_share=0.68, culled_loss_db=0.1,
+        cells_per_pixel=1.55, contracted_resolution=640, feature_share=0.68, culled_loss_db=0.05,
         n_channels=16, channel_loss_db=0.25, n_fetches=12, sample_loss_db=0.1,
         code_loss_db=0.67, density_step=6, code_levels=50, head_width=48, head_layers=1,
         head_bands=3, head_bits=8, refine_steps=3600, mesh_resolution=48, target_loss_db=1.0,
@@ -92,7 +92,7 @@ PRESETS: dict[Preset, BakeChoice] = {
     ),
     "phone": BakeChoice(
         preset="phone",
-        cells_per_pixel=1.45, contracted_resolution=1280, feature_share=0.68, culled_loss_db=0.1,
+        cells_per_pixel=1.45, contracted_resolution=1280, feature_share=0.68, culled_loss_db=0.05,
         n_channels=16, channel_loss_db=0.25, n_fetches=8, sample_loss_db=0.3,
         code_loss_db=0.4, density_step=6, code_levels=50, head_width=32, head_layers=1,
         head_bands=3, head_bits=8, refine_steps=3000, mesh_resolution=48, target_loss_db=1.5,
@@ -106,7 +106,7 @@ PAGE_MB: dict[Preset, int] = {"fidelity": 1024, "balanced": 512, "fast": 512, "p
 UNBOUNDED: dict[Preset, dict[str, Any]] = {
     "fidelity": {"refine_steps": 400, "feature_share": 1.0, "n_channels": 24},
     "balanced": {
-        "refine_steps": 2100,
+        "refine_steps": 2600,
         "minutes": 10,
         "feature_share": 1.0,
         "n_channels": 24,
@@ -118,14 +118,14 @@ UNBOUNDED: dict[Preset, dict[str, Any]] = {
         "target_loss_db": 0.5,
     },
     "fast": {
-        "refine_steps": 1200,
+        "refine_steps": 1500,
         "feature_share": 0.58,
         "n_channels": 12,
         "channel_loss_db": 0.5,
         "sample_loss_db": 0.15,
         "code_loss_db": 0.1,
     },
-    "phone": {"refine_steps": 1200, "feature_share": 1.0, "channel_loss_db": 0.5, "code_loss_db": 0.15},
+    "phone": {"refine_steps": 1500, "feature_share": 1.0, "channel_loss_db": 0.5, "code_loss_db": 0.15},
 }
 """Settings that the presets choose differently for an unbounded scene. Its rays have several times as many
 fetches, which take more time; and most of the loss comes from the features, because the grid has so few

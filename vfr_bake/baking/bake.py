@@ -2,8 +2,8 @@
 and measure the loss of each step.
 
 The loss of each step is measured on pixels of photographs that training has not learned from, and on views
-between the training cameras. What may be left out cell by cell, brick by brick and code by code is decided on
-training pixels (`vfr_bake.baking.held_out`). The final result is measured by playing the written files.
+between the training cameras. What may be left out brick by brick and code by code is decided on training
+pixels (`vfr_bake.baking.held_out`). The final result is measured by playing the written files.
 """
 
 from __future__ import annotations
@@ -33,12 +33,11 @@ from player.files.memory import give_back
 from player.head.head import Head
 from player.progress import Report
 from vfr_bake import __version__
-from vfr_bake.baking.cells import find_cells, fit_cells, lattice_step
+from vfr_bake.baking.cells import find_cells, fit_cells, lattice_step, marking_grid
 from vfr_bake.baking.detail.detail import Detail, Needed
 from vfr_bake.baking.distillation import (
     TeacherRays,
-    photographed_rays,
-    render_teacher,
+    teacher_rays,
     with_field_features,
 )
 from vfr_bake.baking.grids import (
@@ -72,7 +71,6 @@ from vfr_bake.baking.plan import (
     check_bakeable,
     make_plan,
     other_bytes,
-    photographed,
     refinement_seconds,
 )
 from vfr_bake.baking.qualities import Qualities, compared_views, fitting_qualities
@@ -134,6 +132,8 @@ class _Bake:
         self.lookups: dict[str, float] = {}
         self.n_fetches = self.choice.n_fetches
         self.plan = make_plan(model, config)
+        self._rendered: TeacherRays | None = None
+        """Training rays that were made to find cells, until they are needed."""
         self._report = report
         self._begun = time.monotonic()
         with self._part("teacher"):
@@ -218,11 +218,17 @@ class _Bake:
     def _cells(self) -> tuple[Layout, int]:
         """Return the layout of the stored densities and features, and the number of the features' cells."""
         model, plan = self.model, self.plan
+        marking = marking_grid(model, self.config, plan.resolutions.features)
+        if marking is not None and plan.marks_with_rays:  # march the training rays once for both
+            with self._part("teacher"):
+                n_rays = plan.n_rays(plan.n_cells)
+                self._rendered = teacher_rays(model, n_rays, False, self._report, marking)
         with self._part("visibility"):
             progress = partial(self._report, "visibility")
             visible, step, left_out = find_cells(
-                model, self.config, plan.resolutions, self.held_out, progress
+                model, self.config, plan.resolutions, self.held_out, marking, progress
             )
+        del marking  # free its marks
         if left_out is not None:
             self.left_out["cells"] = left_out
         limits = list(self._room_for_cells())
@@ -268,20 +274,14 @@ class _Bake:
         """Compute the values to store, before refinement.
 
         Returns the codes of the field's densities and projected features with the head that takes them, the
-        training rays of the refinement, and a function that computes the unrefined feature codes again.
+        training rays of the refinement (about `n_rays`, if they are not made yet), and a function that
+        computes the unrefined feature codes again.
         """
         model, choice, held_out = self.model, self.choice, self.held_out
-        cameras = model.model_cameras()
-        with self._part("teacher"):
-            views = views_between(model, BETWEEN * len(cameras), seed=1, wide=layout.contracted)
-            n_photographed = photographed(model, n_rays)
-            if not n_photographed:
-                views = cameras + views
-            progress = partial(self._report, "teacher")
-            teacher = render_teacher(model, views, n_rays - n_photographed, 0, progress)
-            if n_photographed:
-                progress = partial(self._report, "photographs")
-                teacher = teacher.and_those(photographed_rays(model, n_photographed, progress))
+        teacher, self._rendered = self._rendered, None
+        if teacher is None:
+            with self._part("teacher"):
+                teacher = teacher_rays(model, n_rays, layout.contracted, self._report)
         with self._part("grid"):
             density = evaluate_densities(model, layout, partial(self._report, "densities"))
             projection = self._projection(teacher)

@@ -3,7 +3,8 @@
 In an object's box, the cells that matter to the pictures are stored. The weight of a single sample says
 little about that: in a fog every sample of a ray weighs next to nothing, but their sum is the picture. So
 cells whose samples weigh less than a floor in every view are left out only if the pictures without them lose
-next to nothing, measured on training pixels.
+next to nothing. That is measured on pixels that training has not learned from: rays through the others mark
+cells themselves.
 
 An unbounded scene has no occupancy grid, and the field holds untrained values where no view has ever put a
 sample. So a cell is stored only if samples that the model's sampler chose on some ray have weight in it.
@@ -24,10 +25,12 @@ from player.march.contracted import MAX_SPEED
 from player.progress import Progress
 from vfr_bake.baking.held_out import BETWEEN, MARGIN, HeldOut, Shown, views_between, widened
 from vfr_bake.config import BakeConfig
+from vfr_bake.field.field import VfrField
 from vfr_bake.kernels.density import LIMITS
 from vfr_bake.kernels.march import chebyshev_distance, render_features
-from vfr_bake.kernels.visibility import mark_visible_cells, mark_weighty_cells
+from vfr_bake.kernels.visibility import mark_weighty_cells, render_and_mark
 from vfr_bake.rendering.compositing import composite
+from vfr_bake.rendering.occupancy import OccupancyGrid
 from vfr_bake.training.model_file import Model
 
 FLOORS = (0.02, 0.01, 0.005, 0.002, 0.001)
@@ -131,10 +134,62 @@ def _overlapping(cells: np.ndarray, resolution: int) -> np.ndarray:
     return cells
 
 
+class MarkingGrid:
+    """An object's occupancy grid that also marks the cells in which samples weigh enough, while features are
+    composited along rays for another purpose."""
+
+    def __init__(self, grid: OccupancyGrid, resolution: int, floors: Sequence[float]) -> None:
+        """`resolution` is that of the marked cells; `floors` are the weights that samples must have."""
+        self._grid, self._floors = grid, np.array(floors, np.float32)
+        self.n_rays = 0
+        """Rays that were marched so far."""
+        self.marks = np.zeros((*(resolution,) * 3, len(floors)), np.uint8)
+        """[resolution, resolution, resolution, n_floors]: 1 for each cell and floor for which a sample in the
+        cell weighs at least the floor."""
+
+    def composited_features(
+        self, field: VfrField, rays_o: np.ndarray, rays_d: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return what `OccupancyGrid.composited_features` returns, and mark cells."""
+        return self._march(field, rays_o, rays_d, float(self._grid.step), field.config.n_channels)
+
+    def mark(self, field: VfrField, rays_o: np.ndarray, rays_d: np.ndarray) -> None:
+        """Mark cells alone, in steps no longer than a cell: samples must not skip cells, because other rays
+        than these will be played."""
+        self._march(field, rays_o, rays_d, min(self._grid.step, 2 / len(self.marks)), 0)
+
+    def _march(
+        self, field: VfrField, rays_o: np.ndarray, rays_d: np.ndarray, step: float, n_channels: int
+    ) -> tuple[np.ndarray, np.ndarray]:
+        features = np.zeros((len(rays_o), n_channels), np.float32)
+        opacity = np.zeros(len(rays_o), np.float32)
+        render_and_mark(
+            rays_o, rays_d, np.float32(step), self._grid.distance, field.arrays(), LIMITS, self._floors,
+            self.marks, features, opacity,
+        )  # fmt: skip
+        self.n_rays += len(rays_o)
+        return features, opacity
+
+
+def marking_grid(model: Model, config: BakeConfig, resolution: int) -> MarkingGrid | None:
+    """Return the grid that marks cells of `resolution` cells an axis for `find_cells`; None for an unbounded
+    scene, and if no cells are to be left out."""
+    if model.field.config.unbounded or config.no_cull:
+        return None
+    floors = FLOORS if config.weight_floor is None else (config.weight_floor,)
+    return MarkingGrid(model.occupancy, resolution, floors)
+
+
 def find_cells(
-    model: Model, config: BakeConfig, resolutions: Resolutions, held_out: HeldOut, progress: Progress
+    model: Model,
+    config: BakeConfig,
+    resolutions: Resolutions,
+    held_out: HeldOut,
+    marking: MarkingGrid | None,
+    progress: Progress,
 ) -> StoredCells:
-    """Find the cells of an object's box, or of contracted space, that matter in some view.
+    """Find the cells of an object's box, or of contracted space, that matter in some view. `marking` is the
+    result of `marking_grid`, with which rays may have been marched already.
 
     Raises TrainingError if nothing is seen.
     """
@@ -152,10 +207,11 @@ def find_cells(
         )
         return StoredCells(visible, lattice_step(resolutions.densities), left_out)
     step = float(model.occupancy.step)
-    if config.no_cull:
+    if marking is None:
         return StoredCells(occupied_cells(model, resolutions.features), step, None)
+    mark_rest(model, marking, progress)
     most_db = config.choice().culled_loss_db
-    cells = cull(model, resolutions.features, held_out, config.weight_floor, most_db, progress)
+    cells = cull(model, marking.marks, held_out, config.weight_floor, most_db)
     return StoredCells(cells.visible, step, cells.report())
 
 
@@ -184,9 +240,9 @@ class CulledCells:
 
 
 def cull(
-    model: Model, resolution: int, held_out: HeldOut, floor: float | None, most_db: float, progress: Progress
+    model: Model, marks: np.ndarray, held_out: HeldOut, floor: float | None, most_db: float
 ) -> CulledCells:
-    """Find the cells of a grid of `resolution` that weigh enough in some view.
+    """Find the cells that weigh enough in some view, by the `marks` of a `MarkingGrid`.
 
     Gaps of one cell between them are closed. Cells beside them in which the model may hold matter are added.
 
@@ -194,9 +250,8 @@ def cull(
     `most_db`, compared with storing all cells. Raises TrainingError if a `floor` was given and no cell
     reaches it.
     """
-    held = occupied_cells(model, resolution)
+    held = occupied_cells(model, len(marks))
     floors = FLOORS if floor is None else (floor,)
-    marks = marked_cells(model, resolution, floors, progress)
     every = _shown(model, held_out, held)
     lost: dict[float, float] = {}
     for level, tried in enumerate(floors):
@@ -204,7 +259,7 @@ def cull(
         if not weighty.any():
             continue
         visible = weighty | (held & beside(weighty))
-        loss = held_out.lost_by_leaving_out(every, _shown(model, held_out, visible))
+        loss = held_out.lost(every, _shown(model, held_out, visible))
         lost[tried] = loss.db
         if loss.most <= most_db or floor is not None:
             removed = 1 - float(visible.sum()) / max(int(held.sum()), 1)
@@ -234,31 +289,24 @@ def _shown(model: Model, held_out: HeldOut, cells: np.ndarray) -> Shown:
     return held_out.compare(features, opacity)
 
 
-def marked_cells(
-    model: Model, resolution: int, weight_floors: tuple[float, ...], progress: Progress
-) -> np.ndarray:
-    """Return [resolution, resolution, resolution, n_floors] uint8: 1 for each cell and floor for which a
-    sample in the cell, on a ray of some view, weighs at least the floor.
+def mark_rest(model: Model, marking: MarkingGrid, progress: Progress) -> None:
+    """March the rays that are still missing for `marking` to have met every surface cell about HITS times.
 
-    Views are the training cameras and as many between them. Whatever the sizes of the pictures and the
-    distances of the cameras, rays are as dense as it takes for every surface cell to be met about HITS times
-    over all views, by each view as often; but there are at most MOST_MARKING.
+    Their views are the training cameras and as many between them. Whatever the sizes of the pictures and the
+    distances of the cameras, rays are as dense as it takes for each view to meet the cells as often; but all
+    rays together are at most MOST_MARKING.
     """
-    marks = np.zeros((*(resolution,) * 3, len(weight_floors)), np.uint8)
+    resolution = len(marking.marks)
+    missing = rays_of_views(model, resolution) - marking.n_rays
+    if missing <= 0:
+        return
     cameras = model.model_cameras()
     cameras += views_between(model, len(cameras), seed=0)
-    # A step no longer than a cell: samples must not skip cells, because other rays than these will be played.
-    step = min(model.occupancy.step, 2 / resolution)
-    thinner = np.sqrt(rays_of_views(model, resolution) / _wanted_rays(model, resolution))
+    thinner = np.sqrt(missing / _wanted_rays(model, resolution))
     for index, camera in enumerate(cameras):
         density = thinner * _ray_density(camera, len(cameras), resolution)
-        rays_o, rays_d = camera.scaled(density).rays()
-        mark_visible_cells(
-            rays_o, rays_d, np.float32(step), model.occupancy.distance,
-            model.field.arrays(), LIMITS, np.array(weight_floors, np.float32), marks,
-        )  # fmt: skip
+        marking.mark(model.field, *camera.scaled(density).rays())
         progress(index + 1, len(cameras))
-    return marks
 
 
 def occupied_cells(model: Model, resolution: int) -> np.ndarray:
@@ -279,7 +327,7 @@ def _footprint(camera: Camera) -> float:
 
 
 def rays_of_views(model: Model, resolution: int) -> float:
-    """Return the expected number of rays that `marked_cells` marches."""
+    """Return the expected number of rays that search for cells."""
     return min(_wanted_rays(model, resolution), MOST_MARKING)
 
 

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -21,15 +22,15 @@ from numba import get_num_threads
 
 from player.asset.grid import SparseGrid, VertexRows
 from player.cameras.camera import Camera
-from player.compiled.samples import sample_rays
+from player.compiled.samples import fetch_places, sample_rays
 from player.errors import TrainingError
-from player.march.fetches import MIN_TOTAL, Samples, equal_mass_bins, heaviest
+from player.march.fetches import MIN_TOTAL
 from player.march.march import MIN_OPACITY, MarchResult
-from player.march.path import path_of
-from player.progress import Progress
+from player.progress import Progress, Report
 from vfr_bake.baking.grids import Layout, unit_points
+from vfr_bake.baking.held_out import BETWEEN, views_between
 from vfr_bake.kernels.stored_features import compose, composite, corner_rows, interpolate, padded, take_runs
-from vfr_bake.rendering.render import render_rays
+from vfr_bake.rendering.render import Compositor, colours_of_features
 from vfr_bake.training.model_file import Model
 
 RAYS_AT_ONCE = 1 << 12
@@ -41,6 +42,9 @@ KEPT_BYTES = 16
 """Bytes of a fetch that is kept in memory: its point, and its length or weight, in float32."""
 N_PROBED = 8
 """Batches of rays after which it is judged whether fetches are worth keeping."""
+PHOTOGRAPHED = 3 / 4
+"""Share of the training rays that go through training pixels, if the model has that many pixels. An object's
+training pixels all lie on it or close to it; of its other rays only a third meet something."""
 N_TYPICAL = 4096
 """Training rays from which the typical size of composites is computed."""
 
@@ -67,8 +71,8 @@ class Fetches(NamedTuple):
     weights: np.ndarray
     """[n_fetches] float32 compositing weights."""
     lengths: np.ndarray
-    """[n_fetches] float32 length of the piece of ray that a sample stands for, model units; 0 if several
-    samples were merged into the fetch. Empty if densities are not trained and fetches are kept."""
+    """[n_fetches] float32 length of the piece of ray that each sample stands for, model units. Without
+    densities it may be empty."""
     opacity: np.ndarray
     """[n] float32 opacity of the baked grid."""
 
@@ -269,7 +273,32 @@ class _Keeper:
         return KeptFetches(starts, self._points[: self._n], self._numbers[: self._n], opacity)
 
 
-def photographed_rays(model: Model, most: int, progress: Progress) -> TeacherRays:
+def teacher_rays(
+    model: Model, n_rays: int, wide: bool, report: Report, sampler: Compositor | None = None
+) -> TeacherRays:
+    """Make about `n_rays` training rays: through training pixels, and in views between the training cameras,
+    which have a border if `wide`. `sampler` stands for the model's own sampler, if it is given."""
+    cameras = model.model_cameras()
+    views = views_between(model, BETWEEN * len(cameras), seed=1, wide=wide)
+    n_photographed = photographed(model, n_rays)
+    if not n_photographed:
+        views = cameras + views
+    teacher = render_teacher(model, views, n_rays - n_photographed, 0, partial(report, "teacher"), sampler)
+    if n_photographed:
+        progress = partial(report, "photographs")
+        teacher = teacher.and_those(photographed_rays(model, n_photographed, progress, sampler))
+    return teacher
+
+
+def photographed(model: Model, n_rays: int) -> int:
+    """Return how many of `n_rays` training rays go through training pixels of the model."""
+    n_pixels = 0 if model.training_pixels is None else len(model.training_pixels.pixels)
+    return min(int(PHOTOGRAPHED * n_rays), n_pixels)
+
+
+def photographed_rays(
+    model: Model, most: int, progress: Progress, sampler: Compositor | None = None
+) -> TeacherRays:
     """Return at most `most` of the rays through the model's training pixels, spread evenly, with the mean of
     the colours of the photographs and of the full model as targets.
 
@@ -280,6 +309,8 @@ def photographed_rays(model: Model, most: int, progress: Progress) -> TeacherRay
     Opaque photographs of an object show its background, too, and do not tell where the object ends. There
     the opacity is the model's alone, and the photograph's colour is what is left of it without the part of
     the background that the model lets through.
+
+    `sampler` stands for the model's own sampler, if it is given.
     """
     rays_o, rays_d, rgba = model.training_pixel_rays()
     shown = rgba.astype(np.float32) / 255
@@ -288,7 +319,9 @@ def photographed_rays(model: Model, most: int, progress: Progress) -> TeacherRay
     n = len(rays.opacity)
     for first in range(0, n, FIELD_RAYS_AT_ONCE):
         some = slice(first, first + FIELD_RAYS_AT_ONCE)
-        colours, opacity = render_rays(model.field, model.sampler, rays.rays_o[some], rays.rays_d[some])
+        colours, opacity = colours_of_features(
+            model.field, sampler or model.sampler, rays.rays_o[some], rays.rays_d[some]
+        )
         if is_over_background:
             behind = (1 - opacity[:, None]) * model.background
             rays.colours[some] = (rays.colours[some] - behind).clip(0, opacity[:, None])
@@ -300,17 +333,22 @@ def photographed_rays(model: Model, most: int, progress: Progress) -> TeacherRay
 
 
 def render_teacher(
-    model: Model, cameras: list[Camera], n_rays: int, seed: int, progress: Progress
+    model: Model,
+    cameras: list[Camera],
+    n_rays: int,
+    seed: int,
+    progress: Progress,
+    sampler: Compositor | None = None,
 ) -> TeacherRays:
     """Render the full model at about `n_rays` random pixels of `cameras` (model frame). Pixels at which it
-    shows nothing are left out."""
+    shows nothing are left out. `sampler` stands for the model's own sampler, if it is given."""
     random = np.random.default_rng(seed)
     parts = []
     for done, camera in enumerate(cameras):
         n_pixels = camera.width * camera.height
         some = random.choice(n_pixels, min(n_pixels, max(n_rays // len(cameras), 1)), replace=False)
         rays_o, rays_d = camera.rays_through(some)
-        colours, opacity = render_rays(model.field, model.sampler, rays_o, rays_d)
+        colours, opacity = colours_of_features(model.field, sampler or model.sampler, rays_o, rays_d)
         met = np.flatnonzero(opacity > 0)
         parts.append((rays_o[met], rays_d[met], colours[met], opacity[met]))
         progress(done + 1, len(cameras))
@@ -368,36 +406,26 @@ class PlayerFetches(NamedTuple):
     weights: np.ndarray
     """[n_fetches] float32 compositing weights."""
     lengths: np.ndarray
-    """[n_fetches] float32 length of the piece of ray that a sample stands for, model units; 0 if several
-    samples were merged into the fetch."""
+    """[n_fetches] float32 length of the piece of ray that each sample stands for, model units; empty unless
+    every sample is a fetch."""
 
 
 def player_fetches(grid: SparseGrid, rays_o: np.ndarray, rays_d: np.ndarray, n_fetches: int) -> PlayerFetches:
     """Find the places where the player fetches features on the rays [n, 3], and the fetches' weights, as
     `player.march.march` has them with k = `n_fetches`."""
-    samples, ways, tau, _, places = sample_rays(grid, rays_o, rays_d, get_num_threads())
-    opacity = -np.expm1(-tau)
-    hits = np.flatnonzero(opacity > MIN_OPACITY)
-    is_hit = np.zeros(len(opacity), bool)
-    is_hit[hits] = True
-    counts = np.bincount(samples.ray, minlength=len(opacity))
-    merged = is_hit[samples.ray] & (counts[samples.ray] > n_fetches) & (n_fetches > 0)
-    kept = is_hit[samples.ray] & ~merged
-    ray, points, weights, lengths = (column[kept] for column in (samples.ray, places, samples.weights, ways))
-    if merged.any():
-        bins = equal_mass_bins(Samples(*(column[merged] for column in samples)), n_fetches)
-        at = np.ascontiguousarray(path_of(grid, rays_o, rays_d).at(bins.ray, bins.s).T)
-        gaps = np.flatnonzero(~corners(grid.rows, at * grid.feature_scale, MIN_TOTAL)[1].any(axis=1))
-        if len(gaps):
-            at[gaps] = places[merged][heaviest(bins, gaps)]
-        ray = np.concatenate([ray, bins.ray])
-        points = np.concatenate([points, at])
-        weights = np.concatenate([weights, opacity[bins.ray] / np.float32(n_fetches)])
-        lengths = np.concatenate([lengths, np.zeros(len(bins.ray), np.float32)])
-        order = np.argsort(ray, kind="stable")
-        ray, points, weights, lengths = ray[order], points[order], weights[order], lengths[order]
+    if n_fetches:
+        ray, points, weights, opacity = fetch_places(grid, rays_o, rays_d, n_fetches, get_num_threads())
+        hits, lengths = np.flatnonzero(opacity > MIN_OPACITY), np.zeros(0, np.float32)
+    else:
+        samples, ways, tau, _, places = sample_rays(grid, rays_o, rays_d, get_num_threads())
+        opacity = -np.expm1(-tau)
+        hits = np.flatnonzero(opacity > MIN_OPACITY)
+        is_kept = (opacity > MIN_OPACITY)[samples.ray]
+        ray, points, weights, lengths = (
+            column[is_kept] for column in (samples.ray, places, samples.weights, ways)
+        )
     counts = np.bincount(ray, minlength=len(opacity))[hits]
-    return PlayerFetches(hits, opacity[hits], counts, points, weights.astype(np.float32), lengths)
+    return PlayerFetches(hits, opacity[hits], counts, points, weights, lengths)
 
 
 def corners(vertices: VertexRows, points: np.ndarray, least: np.float32) -> Corners:

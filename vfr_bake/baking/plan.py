@@ -26,7 +26,7 @@ from vfr_bake.baking.cells import (
     rays_of_contracted_views,
     rays_of_views,
 )
-from vfr_bake.baking.distillation import render_teacher
+from vfr_bake.baking.distillation import photographed, render_teacher
 from vfr_bake.baking.head import fold_head, small_head
 from vfr_bake.baking.held_out import BETWEEN
 from vfr_bake.baking.limits import WIDTHS, cells_of_page
@@ -45,13 +45,10 @@ fewer rays, the head and the stored values overfit to them."""
 UNBOUNDED_RAYS = 2_500_000
 """Training rays of an unbounded scene's refinement, where there is memory for them: fewer than for an object,
 because every ray meets something, at many samples each."""
-RAYS_OF_DRAW, FEW_DRAWN = 1.2, 500_000
+RAYS_OF_DRAW, FEW_DRAWN = 0.6, 500_000
 """Limits on the number of training rays. At most RAYS_OF_DRAW rays are made for each ray that the steps of
-refinement draw: five of six rays meet something, so each of those is drawn about once. This limit never goes
+refinement draw: five of six rays meet something, so each of those is drawn about twice. This limit never goes
 below FEW_DRAWN, because the stored values are also chosen by some of these rays."""
-PHOTOGRAPHED = 3 / 4
-"""Share of the training rays that go through training pixels, if the model has that many pixels. An object's
-training pixels all lie on it or close to it; of its other rays only a third meet something."""
 RAYS_SHARE = 0.3
 """Share of the memory for cells and rays that is reserved for the rays, if they need it."""
 FEWEST_RAYS = 100_000
@@ -62,6 +59,9 @@ RAYS_OF_CELL = 2.0
 RAY_BYTES = 120
 """Bytes that a training ray takes. The ray and its target colour take 40 bytes; rays that meet something in
 the grid are copied, which takes 40 more; concatenating the rays takes another 40."""
+MADE_RAY_BYTES = 40
+"""Bytes of these that it takes once the training rays are made: an object's are made before its cells are
+chosen."""
 REFINED_SHARE = 0.5
 """Share of the bytes of a cell that it takes while refinement trains. What it takes only later, while codes
 are chosen, can hold fetches of the training rays until then."""
@@ -92,6 +92,8 @@ VERTEX_COST, SEEN_COST = {False: 0.17, True: 0.18}, {False: 0.48, True: 1.0}
 AT_K_COST = 0.7
 """Time of a step of refinement with the lookups and bits that are played, as a share of that of a step before
 these were chosen."""
+TYPICAL_LOSS = 3.5
+"""Loss before refinement, in target losses of the preset, from which its number of steps is estimated."""
 OWN_HEAD = 2
 """Factor on the time of a step with the model's own head."""
 REST_COST, OWN_REST_COST = {False: 12_000_000, True: 5_000_000}, {False: 20_000_000, True: 3_700_000}
@@ -126,7 +128,7 @@ class Plan:
     room: float
     """Bytes available for cells and rays together."""
     marks: float
-    """Bytes of the marks by which the stored cells are found. They are freed before `room` is used."""
+    """Bytes of the marks by which the stored cells are found. They are freed before there are cells."""
     page_cells: float
     """Cells that fit into a page of the asset; infinite if the resolution was given."""
     most_rays: int
@@ -150,8 +152,15 @@ class Plan:
     def kept_bytes(self, n_cells: float) -> int:
         """Return the bytes that the fetches of all training rays may take while `n_cells` cells are
         refined."""
-        taken = REFINED_SHARE * n_cells * self.cell_bytes + self.n_rays(n_cells) * RAY_BYTES
+        n_rays = self.n_rays(self.n_cells if self.marks_with_rays else n_cells)
+        taken = REFINED_SHARE * n_cells * self.cell_bytes + n_rays * RAY_BYTES
         return int(max(self.room - taken, 0))
+
+    @property
+    def marks_with_rays(self) -> bool:
+        """Whether there is room for the training rays beside the marks of an object's cells."""
+        made = MADE_RAY_BYTES * self.n_rays(self.n_cells)
+        return not self.unbounded and self.marks + made <= self.room
 
     def coarser(self) -> Plan:
         """Return the plan of a bake whose frames take less time: with coarser grids and longer steps."""
@@ -162,8 +171,10 @@ class Plan:
     @property
     def n_bytes(self) -> int:
         """Expected peak of memory, bytes."""
-        held = self.n_cells * self.cell_bytes + self.n_rays(self.n_cells) * RAY_BYTES
-        return int(PROGRAM_BYTES + max(self.marks, min(held, self.room)))
+        n_rays = self.n_rays(self.n_cells)
+        marks = self.marks + (MADE_RAY_BYTES * n_rays if self.marks_with_rays else 0)
+        held = self.n_cells * self.cell_bytes + n_rays * RAY_BYTES
+        return int(PROGRAM_BYTES + max(marks, min(held, self.room)))
 
 
 def check_bakeable(model: Model, config: BakeConfig) -> None:
@@ -189,9 +200,12 @@ def make_plan(model: Model, config: BakeConfig) -> Plan:
             f"{len(model.cameras)} cameras, the head and the manifest alone: nothing was written: allow more"
         )
     room = config.memory * 1e9 - PROGRAM_BYTES
+    drawn = max(int(RAYS_OF_DRAW * choice.refine_steps * BATCH), FEW_DRAWN)
+    most_rays = min(UNBOUNDED_RAYS if field.unbounded else N_RAYS, drawn)
     mark_bytes = _marks_bytes(model, config)
     wanted = _resolutions(model, config, np.inf)
-    resolutions = _resolutions(model, config, int(np.cbrt(max(room, 0) / mark_bytes)))
+    rays_room = 0 if field.unbounded else min(MADE_RAY_BYTES * most_rays, RAYS_SHARE * room)
+    resolutions = _resolutions(model, config, int(np.cbrt(max(room - rays_room, 0) / mark_bytes)))
     fine, coarse = resolutions
     marks = mark_bytes * coarse**3
     n_channels = min(choice.n_channels, field.n_channels)
@@ -199,8 +213,6 @@ def make_plan(model: Model, config: BakeConfig) -> Plan:
     cell_bytes += DENSITY_BYTES * (fine / coarse) ** 3
     given = config.resolution or config.feature_resolution
     page_cells = np.inf if given else cells_of_page(choice.page_mb, n_channels, (fine / coarse) ** 3)
-    drawn = max(int(RAYS_OF_DRAW * choice.refine_steps * BATCH), FEW_DRAWN)
-    most_rays = min(UNBOUNDED_RAYS if field.unbounded else N_RAYS, drawn)
     n_cells = _cells(model, coarse)
     plan = Plan(resolutions, wanted, n_cells, cell_bytes, field.unbounded, room, marks, page_cells, most_rays)
     plan = replace(plan, n_cells=min(plan.n_cells, max(plan.most_cells, 0), page_cells))
@@ -271,12 +283,6 @@ def _cells(model: Model, resolution: int) -> float:
     return float(np.count_nonzero(occupied_cells(model, resolution)))
 
 
-def photographed(model: Model, n_rays: int) -> int:
-    """Return how many of `n_rays` training rays go through training pixels of the model."""
-    n_pixels = 0 if model.training_pixels is None else len(model.training_pixels.pixels)
-    return min(int(PHOTOGRAPHED * n_rays), n_pixels)
-
-
 def expected_seconds(model: Model, config: BakeConfig, plan: Plan) -> float:
     """Estimate the seconds that the bake will take, by timing the teacher on some rays on this machine."""
     choice, unbounded = config.choice(model.field.config.unbounded), model.field.config.unbounded
@@ -298,8 +304,9 @@ def expected_seconds(model: Model, config: BakeConfig, plan: Plan) -> float:
         work += SEEN_COST[True] * rays_of_contracted_views(model, coarse)
     elif not config.no_cull:
         steps = max(model.occupancy.step * coarse / 2, 1.0)
-        work += SEEN_COST[False] * steps * rays_of_views(model, coarse)
-    n_steps = refined_steps(config, choice, n_met)
+        marched = n_all if plan.marks_with_rays else 0
+        work += SEEN_COST[False] * steps * max(rays_of_views(model, coarse) - marched, 0)
+    n_steps = refined_steps(config, choice, n_met, TYPICAL_LOSS * choice.target_loss_db)
     refined = (n_steps + AT_K_COST * steps_at_k(n_steps)) * BATCH * STEP_COST[unbounded]
     refined += head_steps(choice) * HEAD_BATCH * HEAD_COST[unbounded]
     before, refinement = ray_seconds * work, ray_seconds * refined * (1 if choice.head_width else OWN_HEAD)

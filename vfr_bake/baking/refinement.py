@@ -61,6 +61,10 @@ overfit to those rays."""
 PASSES = 10
 """Passes of a round of refinement over the training rays, unless they take more steps than the preset has. So
 a small scene, whose vertices can be trained with few rays, takes few steps."""
+WHOLE_LOSS, LEAST_SHARE = 4.0, 0.7
+"""Loss before refinement, in target losses of the preset, for which a bake takes all steps of the preset; and
+the least share of them that it takes. A sharper model loses more before refinement, and needs more steps to
+make up for it (docs/notes/2026-11-30-steps-by-what-is-lost.md)."""
 HEAD_STEPS = 2000
 """Steps in which a small head is trained alone before refinement."""
 HEAD_SHARE = 3
@@ -105,11 +109,14 @@ class Stored:
     """[n_densities] float32 codes in 0..255, which need not be whole."""
 
 
-def refined_steps(config: BakeConfig, choice: BakeChoice, n_rays: float) -> int:
-    """Return the steps of the first round of refinement with `n_rays` training rays that meet something,
-    unless the number of steps was given."""
+def refined_steps(config: BakeConfig, choice: BakeChoice, n_rays: float, lost_db: float) -> int:
+    """Return the steps of the first round of refinement with `n_rays` training rays that meet something, if
+    `lost_db` are lost before it; or the number of steps that was given."""
     most = choice.refine_steps
-    return most if config.refine_steps is not None else min(int(PASSES * n_rays / BATCH) + 1, most)
+    if config.refine_steps is not None:
+        return most
+    share = float(np.clip(lost_db / (WHOLE_LOSS * choice.target_loss_db), LEAST_SHARE, 1.0))
+    return min(int(PASSES * n_rays / BATCH) + 1, int(np.ceil(share * most)))
 
 
 def steps_at_k(refined: int) -> int:
@@ -169,8 +176,8 @@ class Tuning:
         head_rate, code_rate = HEAD_RATE, CODE_RATE * choice.code_levels / 127
         before = self._held_out.stages[-1]
         densities = grid.rows if layout.densities is layout.features else layout.densities.rows()
-        asked = refined_steps(self._config, choice, len(teacher.opacity))
-        keeping = self._keeping("refinement", asked, teacher)
+        most = refined_steps(self._config, choice, len(teacher.opacity), np.inf)
+        keeping = self._keeping("refinement", most, teacher)
         rays = collect_training_rays(teacher, grid, 0, densities, keeping)
         if choice.head_width:
             stored = replace(stored, head=self._new_head(stored.head, rays.typical(stored.features)))
@@ -179,7 +186,8 @@ class Tuning:
             before = self._held_out.measure("small head", grid, runner(stored.head), 0)
             head_rate = NEW_HEAD_RATE / 2
             self.left_out["head"] = f"a wider head than of {choice.head_width}: the loss of 'small head'"
-        with self._steps("refinement", refined_steps(self._config, choice, len(rays))) as steps:
+        asked = refined_steps(self._config, choice, len(rays), before.loss.db)
+        with self._steps("refinement", asked) as steps:
             tuned = refine(stored, rays, steps, layout.density_range, head_rate, code_rate)
         del rays, densities  # frees the rows of the old grid: there may be no memory for two
         grid = layout.grid(tuned.density, tuned.features)
@@ -201,7 +209,7 @@ class Tuning:
                 del grid
                 grid = layout.grid(stored.density, stored.features)
         self.kept = self._choose_lookups_and_bits(stored, grid, teacher)
-        return self._refined_at_k(stored, grid, teacher, AT_K * head_rate, code_rate)
+        return self._refined_at_k(stored, grid, teacher, steps_at_k(asked), AT_K * head_rate, code_rate)
 
     def _in_enough_bits(self, stored: Stored, tuned: Stored) -> Stored:
         """Return `tuned`; or `stored`, with its head in float32, if 8 bits lose too much even after
@@ -223,15 +231,14 @@ class Tuning:
         stored: Stored,
         grid: SparseGrid,
         teacher: TeacherRays,
+        asked: int,
         head_rate: float,
         code_rate: float,
     ) -> Stored:
-        """Refine head and features with the lookups and bits that are played, and keep the result if it gains
-        anything. Changes the features of `stored` in place."""
-        asked = steps_at_k(refined_steps(self._config, self._choice, len(teacher.opacity)))
+        """Refine head and features with the lookups and bits that are played, in at most `asked` steps, and
+        keep the result if it gains anything. Changes the features of `stored` in place."""
         keeping = self._keeping("refinement at k", asked, teacher)
         rays = collect_training_rays(teacher, grid, self.n_fetches, keeping=keeping)
-        asked = steps_at_k(refined_steps(self._config, self._choice, len(rays)))
         left = stored.features.astype(np.int8)  # the low bytes, which `whole_codes` rounds away
         with self._steps("refinement at k", asked) as steps:
             tuned = refine(stored, rays, steps, None, head_rate, code_rate, self.ranges)

@@ -13,9 +13,10 @@ from vfr_bake.kernels.march import next_sample, ray_box
 
 
 @njit(parallel=True, cache=True, fastmath=FLAGS, error_model="numpy")
-def mark_visible_cells(rays_o, rays_d, step, distance, field, limits, weight_floors, visible):
-    """Set `visible` [r, r, r, n] (uint8) to 1 for the cells in which some ray has a sample whose weight is at
-    least `weight_floors[i]`, for each of the n floors.
+def render_and_mark(rays_o, rays_d, step, distance, field, limits, weight_floors, visible, out, opacity):
+    """Composite features along rays as `vfr_bake.kernels.march.render_features` does, and set `visible`
+    [r, r, r, n] (uint8) to 1 for the cells in which some ray has a sample whose weight is at least
+    `weight_floors[i]`, for each of the n floors. If `out` is [n_rays, 0], cells are marked without features.
 
     Several threads may set one cell. All write the same 1, so the result does not depend on their order.
     """
@@ -38,6 +39,8 @@ def mark_visible_cells(rays_o, rays_d, step, distance, field, limits, weight_flo
                 i += 1
                 delta = look_up(ux, uy, uz, field, limits, feature, hidden) * step
                 weight = -np.exp(-tau) * np.expm1(-delta)
+                for c in range(out.shape[1]):
+                    out[ray, c] += weight * feature[c]
                 for level in range(weight_floors.shape[0]):
                     if weight >= weight_floors[level]:
                         x, y, z = (
@@ -45,6 +48,7 @@ def mark_visible_cells(rays_o, rays_d, step, distance, field, limits, weight_flo
                         )  # fmt: skip
                         visible[x, y, z, level] = 1
                 tau += delta
+            opacity[ray] = -np.expm1(-tau)
 
 
 @njit(parallel=True, cache=True, error_model="numpy")

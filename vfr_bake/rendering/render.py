@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TypeAlias
+from typing import Protocol, TypeAlias
 
 import numpy as np
 import torch
@@ -29,6 +29,16 @@ RAY_CHUNK = 1024
 Sampler: TypeAlias = OccupancyGrid | ProposalSampler
 """The guide that chooses where along rays a field is looked up: an object's occupancy
 grid, or a scene's proposals."""
+
+
+class Compositor(Protocol):
+    """A sampler, or what stands for one where features are composited."""
+
+    def composited_features(
+        self, field: VfrField, rays_o: np.ndarray, rays_d: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return (features [n_rays, n_channels], opacity [n_rays]) of rays [n_rays, 3]."""
+        ...
 
 
 @torch.no_grad()
@@ -65,7 +75,7 @@ def render_rays(
     field: VfrField, sampler: Sampler, rays_o: np.ndarray, rays_d: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return (colours times opacity [n_rays, 3], opacity [n_rays]) of rays [n_rays, 3] in the model frame."""
-    render = _composited_colours if field.config.compositing == "colour" else _colours_of_features
+    render = _composited_colours if field.config.compositing == "colour" else colours_of_features
     return render(field, sampler, rays_o, rays_d)
 
 
@@ -77,8 +87,8 @@ def mean_colour(field: VfrField, sampler: Sampler, cameras: Sequence[Camera]) ->
     return np.mean(pictures, axis=(0, 1, 2))
 
 
-def _colours_of_features(
-    field: VfrField, sampler: Sampler, rays_o: np.ndarray, rays_d: np.ndarray
+def colours_of_features(
+    field: VfrField, sampler: Compositor, rays_o: np.ndarray, rays_d: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Composite features, then colour them with one evaluation of the head per ray (equation 3): return
     (colours times opacity [n_rays, 3], opacity [n_rays])."""

@@ -326,8 +326,8 @@ def test_a_training_ray_composes_what_the_player_composes(model: Model, n_fetche
     found = player_fetches(grid, rays_o, rays_d, n_fetches)
     assert np.array_equal(found.hits, played.hits) and len(found.hits) > 100
     np.testing.assert_allclose(found.opacity, played.opacity[found.hits], rtol=1e-6)  # compiled, and in numpy
-    merged = found.lengths == 0  # for several samples; a ray with at most n_fetches samples has none
-    assert (found.lengths[~merged] == grid.step).all() and merged.any() == (n_fetches > 0)
+    assert len(found.lengths) == (0 if n_fetches else len(found.weights))
+    assert (found.lengths == grid.step).all() and found.counts.max() == (n_fetches or found.counts.max())
     nothing = np.zeros_like(rays_o)
     teacher = TeacherRays(rays_o, rays_d, nothing, nothing[:, 0])
     training_rays = collect_training_rays(teacher, grid, n_fetches)

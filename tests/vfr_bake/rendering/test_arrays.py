@@ -21,7 +21,7 @@ from player.compiled.lanes import LANES
 from vfr_bake.kernels import adam, hash_grid, proposals
 from vfr_bake.kernels.contraction import contracted_unit
 from vfr_bake.field.field import VfrField
-from vfr_bake.kernels.visibility import mark_visible_cells
+from vfr_bake.kernels.visibility import render_and_mark
 from vfr_bake.rendering.occupancy import OccupancyGrid
 from vfr_bake.rendering.proposals import ProposalSampler
 from vfr_bake.kernels.density import LIMITS
@@ -84,7 +84,10 @@ for kind in ("object", "unbounded"):
         found["sigmas"] = samples.sigmas.numpy()
         visible = np.zeros((9, 9, 9, 2), np.uint8)
         arguments = (np.float32(0.1), sampler.distance, field.arrays(), LIMITS)
-        mark_visible_cells(rays_o.numpy(), rays_d.numpy(), *arguments, np.float32([0.01, 0.2]), visible)
+        composited = np.zeros((5, 2 * options.n_levels), np.float32), np.zeros(5, np.float32)
+        floors = np.float32([0.01, 0.2])
+        render_and_mark(rays_o.numpy(), rays_d.numpy(), *arguments, floors, visible, *composited)
+        found["marked features"], found["marked opacity"] = composited
         found["visible"] = visible
     for name in ("t_mid", "deltas", "points", "features", "counts"):
         found[f"{kind} {name}"] = getattr(samples, name).detach().numpy()
