@@ -419,7 +419,7 @@ class BakeConfig:
         >>> BakeConfig(k=3).choice().n_fetches, BakeConfig(k="auto").choice().n_fetches
         (3, 12)
         >>> BakeConfig().choice(unbounded=True).refine_steps
-        2100
+        2600
         """
         preset = _choice(self.preset or "balanced", unbounded)
         given = {name: getattr(self, name, None) for name in BakeChoice.__dataclass_fields__}

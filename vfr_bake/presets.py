@@ -22,7 +22,10 @@ class BakeChoice:
     feature_share: float
     """Resolution of the features, as a share of that of the densities; at most the field's finest level."""
     culled_loss_db: float
-    """Largest loss in dB for which cells are left out; the loss from that alone."""
+    """Largest loss in dB for which an object's cells are left out before refinement; the loss from that
+    alone."""
+    detail_loss_db: float
+    """Largest loss in dB for which detail is dropped after refinement, unless less loss was asked for."""
     n_channels: int
     """Largest number of feature channels."""
     channel_loss_db: float
@@ -69,7 +72,7 @@ PRESETS: dict[Preset, BakeChoice] = {
     "fidelity": BakeChoice(
         preset="fidelity",
         cells_per_pixel=1.95, contracted_resolution=1536, feature_share=0.68, culled_loss_db=0.01,
-        n_channels=22, channel_loss_db=0.03, n_fetches=16, sample_loss_db=0.005,
+        detail_loss_db=0.02, n_channels=22, channel_loss_db=0.03, n_fetches=16, sample_loss_db=0.005,
         code_loss_db=0.02, density_step=2, code_levels=127, head_width=0, head_layers=3,
         head_bands=4, head_bits=8, refine_steps=1200, mesh_resolution=128, target_loss_db=0.05,
         page_mb=1024,
@@ -77,7 +80,7 @@ PRESETS: dict[Preset, BakeChoice] = {
     "balanced": BakeChoice(
         preset="balanced",
         cells_per_pixel=1.65, contracted_resolution=1408, feature_share=0.775, culled_loss_db=0.02,
-        n_channels=16, channel_loss_db=0.15, n_fetches=12, sample_loss_db=0.05,
+        detail_loss_db=0.06, n_channels=16, channel_loss_db=0.15, n_fetches=12, sample_loss_db=0.05,
         code_loss_db=0.13, density_step=4, code_levels=50, head_width=64, head_layers=3,
         head_bands=4, head_bits=8, refine_steps=3000, mesh_resolution=128, target_loss_db=0.4,
         page_mb=512,
@@ -85,7 +88,7 @@ PRESETS: dict[Preset, BakeChoice] = {
     "fast": BakeChoice(
         preset="fast",
         cells_per_pixel=1.55, contracted_resolution=640, feature_share=0.68, culled_loss_db=0.05,
-        n_channels=16, channel_loss_db=0.25, n_fetches=12, sample_loss_db=0.1,
+        detail_loss_db=0.1, n_channels=16, channel_loss_db=0.25, n_fetches=12, sample_loss_db=0.1,
         code_loss_db=0.67, density_step=6, code_levels=50, head_width=48, head_layers=1,
         head_bands=3, head_bits=8, refine_steps=3600, mesh_resolution=48, target_loss_db=1.0,
         page_mb=512,
@@ -93,7 +96,7 @@ PRESETS: dict[Preset, BakeChoice] = {
     "phone": BakeChoice(
         preset="phone",
         cells_per_pixel=1.45, contracted_resolution=1280, feature_share=0.68, culled_loss_db=0.05,
-        n_channels=16, channel_loss_db=0.25, n_fetches=8, sample_loss_db=0.3,
+        detail_loss_db=0.1, n_channels=16, channel_loss_db=0.25, n_fetches=8, sample_loss_db=0.3,
         code_loss_db=0.4, density_step=6, code_levels=50, head_width=32, head_layers=1,
         head_bands=3, head_bits=8, refine_steps=3000, mesh_resolution=48, target_loss_db=1.5,
         page_mb=384,

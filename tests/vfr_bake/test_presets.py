@@ -33,8 +33,9 @@ def test_a_row_says_what_the_preset_decides(name: str) -> None:
     preset = PRESETS[name]  # type: ignore[index]
     *numbers, head, aim = rows()[name]
     told = (
-        *(preset.cells_per_pixel, preset.feature_share, f"{preset.culled_loss_db} dB", preset.n_channels),
-        *(preset.code_levels, preset.n_fetches),
+        *(preset.cells_per_pixel, preset.feature_share),
+        *(f"{preset.culled_loss_db} dB", f"{preset.detail_loss_db} dB"),
+        *(preset.n_channels, preset.code_levels, preset.n_fetches),
     )
     assert numbers == [str(value) for value in told]
     assert aim == f"{preset.target_loss_db} dB"

@@ -160,7 +160,7 @@ class _Bake:
         self.left_out |= tuning.left_out
         head = head_onnx(stored.head, tuning.ranges)
         played = runner(stored.head, tuning.ranges)
-        most_db = self.choice.culled_loss_db
+        most_db = self.choice.detail_loss_db
         if limit is not None:
             left_db = limit - loss.db
             most_db = min(most_db, max(DETAIL_SHARE * left_db, 0.0))

@@ -363,7 +363,7 @@ def test_the_asset_plays_what_the_model_shows(model: Model, tmp_path: Path) -> N
     assert losses["refined"] > losses["codes"] + 1, "refinement gets back what the bake lost"
     lost = {stage["name"]: stage["loss_db"] for stage in result.figures["stages"]}
     better = min(lost[name] for name in ("head in 8 bits", "refined at k") if name in lost)
-    allowed = 1.5 * PRESETS["fidelity"].culled_loss_db + PRESETS["fidelity"].code_loss_db
+    allowed = 1.5 * PRESETS["fidelity"].detail_loss_db + PRESETS["fidelity"].code_loss_db
     assert lost["files"] - better < allowed + 0.05, "detail and bits are left out by what the witnesses lose"
 
 
