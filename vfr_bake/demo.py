@@ -24,7 +24,7 @@ from player.app.option_types import number
 from player.child import python_command
 from player.files.files import check_target, write_bytes
 
-TRAIN_MINUTES = 2.25
+TRAIN_MINUTES = 2.0
 """Default training time in minutes, compiling included: two cores with AVX2 reach 34 dB in it."""
 REFINE_STEPS = 600
 """Steps of the first round of refinement, a compromise between 500 and 1,000: with 1,000 the loss is 0.1 dB
