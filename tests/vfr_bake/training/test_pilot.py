@@ -49,10 +49,10 @@ def one_thread() -> Iterator[None]:
 
 
 def psnr(scene: Scene, pilot_steps: int, seed: int) -> float:
-    """Return the PSNR on held-out views, after 300 steps with 10 layers of 256 and the paper's rate."""
+    """Return the PSNR on held-out views, after 300 steps with 10 layers of 256 and twice the paper's rate."""
     config = TrainConfig(
         device="cpu", steps=300, minutes=60.0, pilot_steps=pilot_steps, batch_samples=4096, seed=seed,
-        network_rate=1e-2, occupancy_resolution=32,
+        network_rate=2e-2, occupancy_resolution=32,
         field=FieldOptions(**SMALL_GRID, head_width=256, n_directional_layers=8),
     )  # fmt: skip
     trainer = Trainer(scene, config)
@@ -69,8 +69,7 @@ def test_a_large_head_needs_the_pilot_to_converge(one_thread: None) -> None:
     blank = np.mean(
         [10 * np.log10(255**2 / np.mean((image[..., :3] - 255.0) ** 2)) for image in scene.test.images]
     )
-    # About every second seed fails: the field stays nearly empty, and the picture white. With the pilot all
-    # seeds reach some 10 dB more, because the head begins when its rate, high for so many layers, is falling.
-    failed = next((seed for seed in (2, 0, 3, 1, 4, 5, 6, 7, 8, 9) if psnr(scene, 0, seed) < blank + 3), None)
-    assert failed is not None
-    assert psnr(scene, 200, failed) > blank + 6
+    # Without the pilot, about three of four seeds fail: the field stays nearly empty, and the picture white.
+    # With it, about as many reach some 8 dB more, because the head begins when its rate, high for so many
+    # layers, is falling. Which seeds these are depends on the processor: its sums have another order.
+    assert any(psnr(scene, 0, seed) < blank + 3 and psnr(scene, 200, seed) > blank + 6 for seed in range(8))
