@@ -155,13 +155,16 @@ def test_imports_have_no_circle(depth: int) -> None:
 
 
 def test_a_folder_can_be_looked_through() -> None:
-    """A folder has at most 15 modules, not counting `__init__.py`, and at most 9 subfolders with modules."""
+    """A folder has at most 15 modules, not counting `__init__.py`, and at most 9 subfolders with modules. A
+    folder of the page has at most 15 files."""
     for folder in {
         path.parent for package in (*PACKAGES, "tests") for path in (REPOSITORY / package).rglob("*.py")
     }:
         modules = [path for path in folder.glob("*.py") if path.name != "__init__.py"]
         rooms = [path for path in folder.iterdir() if path.is_dir() and any(path.rglob("*.py"))]
         assert len(modules) <= 15 and len(rooms) <= 9, folder
+    for folder in {path.parent for path in (REPOSITORY / "player/page/web").rglob("*") if path.is_file()}:
+        assert len([path for path in folder.iterdir() if path.is_file()]) <= 15, folder
 
 
 STARTERS = re.compile(

@@ -3,7 +3,8 @@
 A web page that is opened from a disk may not load modules from files. So the modules of `player/page/web` use
 only a small part of the language, so that they can be joined line by line, without a parser:
 
-- an import begins a line and reads `import { a, b as c } from "./name.js";`;
+- an import begins a line and reads `import { a, b as c } from "./name.js";` or `from "../folder/name.js";`;
+  no two files have the same name, so only browsers that load modules one by one need the folder;
 - an export begins a line and is `export` before `function`, `async function`, `class` or `const` and a name;
 - imports have no circle, and nothing awaits outside of a function.
 
@@ -19,7 +20,7 @@ from collections.abc import Mapping
 
 from player.errors import FormatError
 
-_IMPORT = re.compile(r'^import \{([^}]*)\} from "\./([\w.-]+)";\n?', re.MULTILINE)
+_IMPORT = re.compile(r'^import \{([^}]*)\} from "\.{1,2}/(?:\w+/)?([\w.-]+)";\n?', re.MULTILINE)
 _EXPORT = re.compile(r"^export ((?:async function\*?|function\*?|class|const) (\w+))", re.MULTILINE)
 _OTHER = re.compile(r"^(import|export)\b.*", re.MULTILINE)
 

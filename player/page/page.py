@@ -8,9 +8,10 @@ page is ASCII throughout, so that it reads the same whatever charset a server cl
 Files of `player/page/web`:
 
 - `*.js` are ES modules that keep to the rules of `player.page.modules`: `main.js` starts the page,
-  `worker.js` decodes the data, and `boot.js` unpacks the script of the page and runs it.
-- `*.glsl` are shaders. They are joined to the module `shaders.js`, which is written here: `import { shaders }
-  from "./shaders.js";`, then `shaders["march.glsl"]`.
+  `worker.js` decodes the data, and `boot.js` unpacks the script of the page and runs it. `scene` has those
+  that load and decode the data, `drawing` those that draw a picture, and `viewer` those that people use.
+- `shaders/*.glsl` are shaders. They are joined to the module `shaders.js`, which is written here: `import {
+  shaders } from "../shaders.js";`, then `shaders["march.glsl"]`.
 - `style.css` is the style.
 - `index.html` is the page. In it, `{{title}}` and `{{advice}}`, which says what to do where the data are not
   beside the page, are replaced by text, `{{poster}}` by an address for `src`, and `{{policy}}`, `{{style}}`,
@@ -207,8 +208,10 @@ def _behind(asset: Asset) -> str:
 def web_files() -> dict[str, str]:
     """Read the modules, the style and the page itself, by file name, without comments and needless spaces,
     and with the shaders as `shaders.js`."""
-    folder = resources.files("player.page") / "web"
-    files = {file.name: file.read_text(encoding="utf-8") for file in folder.iterdir() if file.is_file()}
+    top = resources.files("player.page") / "web"
+    folders = [top, *(entry for entry in top.iterdir() if entry.is_dir())]
+    entries = [entry for folder in folders for entry in folder.iterdir() if entry.is_file()]
+    files = {file.name: file.read_text(encoding="utf-8") for file in entries}
     found = {name: _stripped(name, text) for name, text in sorted(files.items())}
     shaders = {name: found.pop(name) for name in list(found) if name.endswith(".glsl")}
     found["shaders.js"] = f"export const shaders = {json.dumps(shaders, indent=0)};\n"

@@ -1,4 +1,4 @@
-"""The camera that a page begins with. `restOf` in `player/page/web/pose.js` is its twin."""
+"""The camera that a page begins with. `restOf` in `player/page/web/viewer/pose.js` is its twin."""
 
 from __future__ import annotations
 

@@ -2,7 +2,7 @@
 //
 //     await vfr.ready;  vfr.info;  await vfr.render({ c2w, fx, fy, cx, cy, width, height, quality, background })
 
-import { column, cross, dot } from "./pose.js";
+import { column, cross, dot } from "./viewer/pose.js";
 
 const SIZES = ["fx", "fy", "cx", "cy", "width", "height"];
 const QUALITIES = ["exact", "high", "fast"];

@@ -4,7 +4,7 @@
 // Programs find `vfr` at the page's load event, when that script may not have run yet. So `early` takes its place until
 // then, and what programs ask of `early` waits.
 
-import { bytesOf } from "./text_bytes.js";
+import { bytesOf } from "./scene/text_bytes.js";
 
 const CHANGED = "the page was cut short or changed on its way";
 const NOT_RUN = "its script was changed on its way, or cannot run in this browser";

@@ -1,13 +1,13 @@
 // The page's entry point: loads and draws the scene, and hands it to the viewer and to programs.
 
 import { installApi } from "./api.js";
-import { Controls } from "./controls.js";
+import { Controls } from "./viewer/controls.js";
 import { optionsOf } from "./hash.js";
-import { loadScene } from "./loader.js";
-import { Panel } from "./panel.js";
-import { Renderer } from "./renderer.js";
-import { refusesMemory } from "./scene_reader.js";
-import { Viewer } from "./viewer.js";
+import { loadScene } from "./scene/loader.js";
+import { Panel } from "./viewer/panel.js";
+import { Renderer } from "./drawing/renderer.js";
+import { refusesMemory } from "./scene/scene_reader.js";
+import { Viewer } from "./viewer/viewer.js";
 
 const INSTEAD = "Open this page in a current Chrome, Edge, Firefox or Safari, with hardware acceleration switched on "
   + "in its settings, or on a device with more memory, or ask for the scene baked with --preset phone.";

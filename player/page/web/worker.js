@@ -2,7 +2,7 @@
 // { id, error, isWhole, isMemory }, where isMemory tells that the device has refused memory. While a part is
 // read, messages { progress } tell the bytes of each section. The worker's first message is { isReady: true }.
 
-import { SceneReader, refusesMemory } from "./scene_reader.js";
+import { SceneReader, refusesMemory } from "./scene/scene_reader.js";
 
 let reader = null;
 

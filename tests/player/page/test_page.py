@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from importlib import resources
 from pathlib import Path
 from threading import Thread
 from typing import NamedTuple
@@ -133,6 +134,17 @@ def test_the_package_has_every_module_that_is_imported() -> None:
     files = web_files()
     assert {"main.js", "worker.js", "boot.js", "style.css", "index.html", "shaders.js"} <= set(files)
     assert page_script(files).isascii()
+
+
+def test_imports_name_files_where_they_lie() -> None:
+    """The joined script finds modules by their names alone, but readers and browsers follow the paths."""
+    top = Path(str(resources.files("player.page"))) / "web"
+    paths = [path for path in top.rglob("*") if path.is_file()]
+    assert len({path.name for path in paths}) == len(paths), "two files have one name"
+    for path in paths:
+        for name in re.findall(r'^import .* from "(.*)";$', path.read_text(), re.MULTILINE):
+            imported = (path.parent / name).resolve()
+            assert imported.is_file() or imported == top / "shaders.js", (path.name, name)
 
 
 # --- the page ---
@@ -495,4 +507,4 @@ def test_a_page_whose_manifest_was_changed_says_so(chromium: Browser, asset: Ass
 def test_an_installed_package_has_the_files_of_the_page() -> None:
     """pyproject.toml lists the page's files. It is read as text, because Python 3.10 has no TOML parser."""
     text = (Path(__file__).parents[3] / "pyproject.toml").read_text(encoding="utf-8")
-    assert '"player.page" = ["web/*"]' in text
+    assert '"player.page" = ["web/*", "web/*/*"]' in text

@@ -32,7 +32,7 @@ def page(chromium: Browser) -> Iterator[Page]:
 def call(page: Page) -> Call:
     """Return a caller of functions of the page's modules, by name and with arguments that JSON can hold."""
 
-    def call(name: str, *arguments: Any, module: str = "pose.js") -> Any:
+    def call(name: str, *arguments: Any, module: str = "viewer/pose.js") -> Any:
         return page.evaluate(
             "async ([module, name, given]) => (await import('./' + module))[name](...given)",
             [module, name, arguments],
@@ -268,12 +268,12 @@ def test_a_flight_begins_and_ends_where_it_should_and_goes_the_shorter_way(
 
 
 def test_sizes_fit_a_window(call: Call) -> None:
-    assert call("fitted", 800, 600, 120_000, module="pace.js") == [400, 300]
-    assert call("fitted", 800, 600, 1e9, module="pace.js") == [800, 600]
-    assert call("fitted", 1, 1, 0, module="pace.js") == [1, 1]
+    assert call("fitted", 800, 600, 120_000, module="viewer/pace.js") == [400, 300]
+    assert call("fitted", 800, 600, 1e9, module="viewer/pace.js") == [800, 600]
+    assert call("fitted", 1, 1, 0, module="viewer/pace.js") == [1, 1]
 
 
-PACED = """([rate, n, width, height, ticksASecond]) => import("./pace.js").then(({ Pace }) => {
+PACED = """([rate, n, width, height, ticksASecond]) => import("./viewer/pace.js").then(({ Pace }) => {
   const pace = new Pace(), sizes = [];
   for (let i = 0; i < n; i++) {
     const [w, h] = pace.moving(width, height), exact = 0.003 + w * h / rate;
@@ -346,7 +346,7 @@ def test_rays_of_a_camera_far_away_are_exact_near_the_scene(call: Call, contract
     }  # fmt: skip
     rays = {
         name: np.asarray(x, np.float32)
-        for name, x in call("raysOf", *as_json([camera]), manifest, module="camera.js").items()
+        for name, x in call("raysOf", *as_json([camera]), manifest, module="drawing/camera.js").items()
     }
     eye = camera.c2w[:3, 3]
     for place in ((0.5, 0.5), (31.5, 24.5), (7.5, 40.5), (63.5, 47.5)):

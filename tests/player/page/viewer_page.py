@@ -129,7 +129,8 @@ def opened(
     missing: list[str] = []
 
     def answer(route: Route) -> None:
-        name = route.request.url.removeprefix("http://localhost/scene/").partition("#")[0]
+        path = route.request.url.removeprefix("http://localhost/scene/").partition("#")[0]
+        name = path if "://" in path else path.rpartition("/")[2]  # modules lie in folders
         if name in files:
             route.fulfill(
                 body=files[name], content_type=TYPES.get(Path(name).suffix, "application/octet-stream")

@@ -4,7 +4,7 @@
 // direction of the ray through (px, py). If the camera is far away, (px, py) is where the middle of the box is seen, and
 // rays begin beside the box: so float32 still resolves the differences between the pixels of the box.
 
-import { add, column, dot } from "./pose.js";
+import { add, column, dot } from "../viewer/pose.js";
 
 const FAR_AWAY = 64; // distance beyond which a camera is far away, in half diagonals of the box
 

@@ -1,7 +1,7 @@
 // Writes the shaders of a scene, from the texts of the .glsl files, and compiles them.
-import { featureWords, LINES_A_LAYER, MANY, NO_LEVEL, rowsALine } from "./grid.js";
+import { featureWords, LINES_A_LAYER, MANY, NO_LEVEL, rowsALine } from "../scene/grid.js";
 import { headCode } from "./head.js";
-import { shaders } from "./shaders.js";
+import { shaders } from "../shaders.js";
 
 export const LAYERS = ["colour", "depth", "normals", "opacity", "middle"];
 const KEPT = 64; // samples that are kept per ray: see fetches.glsl

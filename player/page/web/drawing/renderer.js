@@ -8,7 +8,7 @@
 // the graphics card draws no sums, is drawn without jitter. `n_fetches` replaces the quality's feature lookups per ray; 0
 // looks features up at every sample.
 import { raysOf } from "./camera.js";
-import { NO_GRID } from "./grid.js";
+import { NO_GRID } from "../scene/grid.js";
 import { multiplyAdds } from "./head.js";
 import { compositeSource, foundTextures, headSource, marchSource, Program } from "./program.js";
 import { checkMemory, deleteFramebuffer, framebufferOf, gpuBytes, isComplete, TILE } from "./textures.js";

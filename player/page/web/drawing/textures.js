@@ -1,5 +1,5 @@
 // Uploads the arrays of a grid as WebGL2 textures, and makes the framebuffers that are drawn to.
-import { blockOf, COLUMN_BRICK, DENSITY_BRICK, featureWords, LINES_A_LAYER, rowsALine } from "./grid.js";
+import { blockOf, COLUMN_BRICK, DENSITY_BRICK, featureWords, LINES_A_LAYER, rowsALine } from "../scene/grid.js";
 
 const MOST_LAYERS = 256; // layers of an array texture that every device has
 const MOST_ROWS = 2 ** 24; // rows that textures.glsl can tell apart: it converts their numbers to float32
