@@ -10,7 +10,6 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
-from importlib import resources
 from pathlib import Path
 from threading import Thread
 from typing import NamedTuple
@@ -26,7 +25,6 @@ from player.asset.asset import Asset
 from player.errors import ConfigError, FormatError
 from player.page import page
 from player.page.gpu_memory import MOST_CHANNELS
-from player.page.modules import joined
 from player.page.page import WebPage, page_of_many_files, page_of_one_file, page_script, web_files
 from player.page.scene_files import scene_files
 from player.page.text_bytes import ALPHABET, bytes_of_text, text_of_bytes
@@ -112,39 +110,6 @@ def test_every_byte_survives_in_a_browser(chromium: Browser, charset: str) -> No
         assert base64.b64decode(found.page.evaluate("n => read(n)", len(data))) == data
         assert found.page.evaluate("n => read(n)", len(data) + 6) is None
         assert found.said == []
-
-
-# --- modules ---
-
-
-def test_modules_that_break_the_rules() -> None:
-    main = {"worker.js": ""}
-    with pytest.raises(FormatError, match=r"circle, got main\.js -> a\.js -> main\.js"):
-        joined(
-            {**main, "main.js": 'import { a } from "./a.js";\n', "a.js": 'import { b } from "./main.js";\n'}
-        )
-    with pytest.raises(FormatError, match=r"main.js: imports: expected a module, got other.js"):
-        joined({**main, "main.js": 'import { a } from "./other.js";\n'})
-    for line in ("export default 1;", "import './a.js';", "export { a };", "export let a = 1;"):
-        with pytest.raises(FormatError, match="another form of import or export"):
-            joined({**main, "main.js": line})
-
-
-def test_the_package_has_every_module_that_is_imported() -> None:
-    files = web_files()
-    assert {"main.js", "worker.js", "boot.js", "style.css", "index.html", "shaders.js"} <= set(files)
-    assert page_script(files).isascii()
-
-
-def test_imports_name_files_where_they_lie() -> None:
-    """The joined script finds modules by their names alone, but readers and browsers follow the paths."""
-    top = Path(str(resources.files("player.page"))) / "web"
-    paths = [path for path in top.rglob("*") if path.is_file()]
-    assert len({path.name for path in paths}) == len(paths), "two files have one name"
-    for path in paths:
-        for name in re.findall(r'^import .* from "(.*)";$', path.read_text(), re.MULTILINE):
-            imported = (path.parent / name).resolve()
-            assert imported.is_file() or imported == top / "shaders.js", (path.name, name)
 
 
 # --- the page ---
@@ -502,9 +467,3 @@ def test_a_page_whose_manifest_was_changed_says_so(chromium: Browser, asset: Ass
     with opened(chromium, path.as_uri()) as found:
         told = found.page.evaluate("() => vfr.ready.then(() => null, (error) => error.message)")
         assert told == "manifest.json: sha256: expected another one: it was changed on its way"
-
-
-def test_an_installed_package_has_the_files_of_the_page() -> None:
-    """pyproject.toml lists the page's files. It is read as text, because Python 3.10 has no TOML parser."""
-    text = (Path(__file__).parents[3] / "pyproject.toml").read_text(encoding="utf-8")
-    assert '"player.page" = ["web/*", "web/*/*"]' in text
