@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from playwright.sync_api import Browser, Page
 
-from tests.player.page.drawn_views import (
+from tests.player.page.viewer.drawn_views import (
     FILES,
     PHONE,
     TARGET,

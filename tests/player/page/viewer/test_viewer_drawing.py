@@ -11,8 +11,8 @@ import pytest
 from PIL import Image
 from playwright.sync_api import Browser
 
-from tests.player.page.drawn_views import FILES, TARGET, UP, VIEWS, distance, drag, height, pixel
 from tests.player.page.test_pose import as_json
+from tests.player.page.viewer.drawn_views import FILES, TARGET, UP, VIEWS, distance, drag, height, pixel
 from tests.player.page.viewer_page import c2w, opened, page_files, still, stub_loader, wait_for
 
 
@@ -172,7 +172,7 @@ def test_embedded_with_a_transparent_background_it_shows_the_page_around_it(chro
 def test_where_it_cannot_be_shown_the_poster_stays_and_a_sentence_says_what_to_do(
     chromium: Browser, why: str
 ) -> None:
-    poster = (Path(__file__).parents[3] / "docs" / "fox.jpg").read_bytes()
+    poster = (Path(__file__).parents[4] / "docs" / "fox.jpg").read_bytes()
     files = page_files(stub_loader(as_json(VIEWS), "" if "WebGL" in why else why), poster)
     if "WebGL" in why:
         files["real_renderer.js"] = files["real_renderer.js"].replace(b'"webgl2"', b'"webgl3"')
@@ -190,7 +190,7 @@ def test_where_it_cannot_be_shown_the_poster_stays_and_a_sentence_says_what_to_d
 
 
 def test_the_poster_is_there_before_the_scene_is(chromium: Browser) -> None:
-    poster = (Path(__file__).parents[3] / "docs" / "fox.jpg").read_bytes()
+    poster = (Path(__file__).parents[4] / "docs" / "fox.jpg").read_bytes()
     loader = stub_loader(as_json(VIEWS)).replace(
         "onProgress({", "await new Promise((go) => (globalThis.go = go)); onProgress({"
     )

@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 from playwright.sync_api import Browser, Page
 
-from tests.player.page.drawn_views import FILES, PHONE, VIEWS, azimuth, drag, height, matches
+from tests.player.page.viewer.drawn_views import FILES, PHONE, VIEWS, azimuth, drag, height, matches
 from tests.player.page.viewer_page import c2w, opened, still, wait_for
 
 
