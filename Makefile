@@ -24,6 +24,9 @@ OTHER_PROGRAMS := blender:blender vdb_print:libopenvdb-tools chromium:chromium g
   firefox-esr:firefox-esr Xvfb:xvfb xauth:xauth
 GLTF_VALIDATOR := gltf-validator@2.0.0-dev.3.10
 
+# Python keeps the bytecode of what it imports, also where the environment forbids it: torch starts twice as fast.
+unexport PYTHONDONTWRITEBYTECODE
+
 .DEFAULT_GOAL := help
 .PHONY: help demo test check docs env format system-libraries debian-programs other-programs clean benchmarks numerics \
   test-all test-pythons test-lowest test-wheel fuzz kill mutations processors
