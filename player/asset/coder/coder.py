@@ -137,11 +137,18 @@ def _fit(
     rows: np.ndarray, known: np.ndarray, classes: Sequence[np.ndarray], n_classes: int
 ) -> tuple[Tables, float]:
     """Return tables fitted to clipped symbols [n_channels, n], and the bits that the symbols then take."""
-    seen = np.empty((len(rows), n_classes * N_CONTEXTS * N_SYMBOLS), np.int64)
+    n_contexts = n_classes * N_CONTEXTS
+    filled, seen = [], []
     for channel, row in enumerate(rows):
-        index = _contexts(row, known, classes[channel]) * N_SYMBOLS + row + END
-        seen[channel] = np.bincount(index, minlength=seen.shape[1])
-    return fit_tables(seen.reshape(len(rows), n_classes, N_CONTEXTS, N_SYMBOLS))
+        context = _contexts(row, known, classes[channel])
+        occurring = np.bincount(context, minlength=n_contexts) > 0
+        number = np.cumsum(occurring) - 1
+        filled.append(np.flatnonzero(occurring) + channel * n_contexts)
+        n_seen = np.bincount(
+            number.take(context) * N_SYMBOLS + row + END, minlength=len(filled[-1]) * N_SYMBOLS
+        )
+        seen.append(n_seen.reshape(-1, N_SYMBOLS))
+    return fit_tables(np.concatenate(seen), np.concatenate(filled), (len(rows), n_classes))
 
 
 class Decoder:

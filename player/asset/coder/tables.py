@@ -130,7 +130,7 @@ def unpack_tables(data: bytes, n_channels: int, n_classes: int, where: str) -> T
     return Tables(counts, named.reshape(n_channels, n_classes, N_CONTEXTS))
 
 
-def fit_tables(seen: np.ndarray) -> tuple[Tables, float]:
+def fit_tables(seen: np.ndarray, filled: np.ndarray, shape: tuple[int, int]) -> tuple[Tables, float]:
     """Return tables fitted to how often each symbol occurs in each context, and the bits of all symbols then.
 
     Contexts that are alike share a table. Tables are added one by one, each from the counts of the context
@@ -138,11 +138,11 @@ def fit_tables(seen: np.ndarray) -> tuple[Tables, float]:
     becomes the sum of its contexts.
 
     Args:
-        seen: [n_channels, n_classes, 81, 127]: how often each symbol occurs in each context.
+        seen: [n_filled, 127] how often each symbol occurs in each context that occurs.
+        filled: [n_filled] indices of these contexts among all n_channels * n_classes * 81, in order.
+        shape: (n_channels, n_classes).
     """
-    every = seen.reshape(-1, N_SYMBOLS).astype(np.float64)
-    filled = np.flatnonzero(every.any(axis=1))
-    used = every[filled]
+    used = seen.astype(np.float64)
     n_seen = used.sum(axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):
         own = -np.nansum(used * np.log2(used / n_seen[:, None]), axis=1)
@@ -168,10 +168,9 @@ def fit_tables(seen: np.ndarray) -> tuple[Tables, float]:
     cost = used @ exact.T
     chosen = cost.argmin(axis=1)
     kept, chosen = np.unique(chosen, return_inverse=True)
-    of_context = np.zeros(len(every), np.uint8)
-    last = np.searchsorted(filled, np.arange(len(every)), side="right") - 1
-    of_context[:] = chosen.reshape(-1)[np.maximum(last, 0)]  # a context without symbols: as the one before
-    found = Tables(counts[kept], of_context.reshape(seen.shape[:-1]))
+    last = np.searchsorted(filled, np.arange(shape[0] * shape[1] * N_CONTEXTS), side="right") - 1
+    of_context = chosen.reshape(-1)[np.maximum(last, 0)]  # a context without symbols: as the one before
+    found = Tables(counts[kept], of_context.astype(np.uint8).reshape(*shape, N_CONTEXTS))
     return found, float(cost.min(axis=1).sum())
 
 

@@ -195,7 +195,8 @@ def test_tables_cost_what_they_say() -> None:
     seen = random.poisson(3 * np.exp(-np.abs(np.arange(-END, END + 1)) / 2), (2, 3, N_CONTEXTS, N_SYMBOLS))
     seen[:, 1] = 0  # contexts that never occur
     seen[0, 0, 5, 0] = 10**6  # and one whose symbols are nearly all the same
-    tables, n_bits = fit_tables(seen)
+    filled = np.flatnonzero(seen.any(axis=-1))
+    tables, n_bits = fit_tables(seen.reshape(-1, N_SYMBOLS)[filled], filled, (2, 3))
     assert TOTAL == 4096
     TABLES.check(tables.counts.sum(axis=1), TOTAL)
     counts = tables.counts[tables.of_context].astype(float)
