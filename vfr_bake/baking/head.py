@@ -9,7 +9,6 @@ places as the exported one; gradients pass as if nothing were rounded (straight-
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -17,10 +16,12 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import gelu, hardswish
 
-from exporters.head.onnx_head import HeadWeights, Layer, Range, levels
+from exporters.head.onnx_head import HeadWeights, Layer, Range, head_onnx, levels
 from player.head.graph import PAIR_LIMIT
+from player.head.head import Head as PlayedHead
+from vfr_bake.data.threads import in_threads
 from vfr_bake.field.networks import HeadNetwork, SphericalHarmonics
-from vfr_bake.rendering.render import head_colours
+from vfr_bake.rendering.render import HEAD_CHUNK
 
 
 def fold_head(head: HeadNetwork, first_layer: np.ndarray) -> HeadWeights:
@@ -175,9 +176,16 @@ class FoldedHead(nn.Module):
 def runner(
     weights: HeadWeights, ranges: tuple[Range, ...] | None = None
 ) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
-    """Return the head as a function from composited features [n, n_channels] and unit directions [n, 3] to
-    colours [n, 3]. With `ranges`, it computes in 8 bits."""
-    return partial(head_colours, FoldedHead(weights, ranges=ranges))
+    """Return the head, run as the player runs it, as a function from composited features [n, n_channels] and
+    unit directions [n, 3], both float32, to colours [n, 3]. With `ranges`, it computes in 8 bits."""
+    head = PlayedHead(head_onnx(weights, ranges), weights.n_channels, compiled=True)
+
+    def colours(features: np.ndarray, dirs: np.ndarray) -> np.ndarray:
+        parts = [slice(first, first + HEAD_CHUNK) for first in range(0, len(features), HEAD_CHUNK)]
+        found = in_threads(lambda part: head(features[part], dirs[part]), parts, None)
+        return np.concatenate([np.empty((0, 3), np.float32), *found])
+
+    return colours
 
 
 def between(first: HeadWeights, second: HeadWeights) -> HeadWeights:
