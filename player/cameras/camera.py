@@ -139,7 +139,7 @@ class Camera:
         rays_d = np.stack([x, y, -np.ones_like(x)], axis=-1) @ self.c2w[:3, :3].T
         rays_d /= np.linalg.norm(rays_d, axis=-1, keepdims=True)
         rays_o = np.broadcast_to(self.c2w[:3, 3], rays_d.shape)
-        return rays_o.astype(np.float32), rays_d.astype(np.float32)
+        return rays_o.astype(np.float32, order="C"), rays_d.astype(np.float32)
 
 
 def _own_pose(c2w: object) -> np.ndarray:

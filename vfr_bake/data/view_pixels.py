@@ -50,7 +50,13 @@ class ViewPixels:
         for camera, pixels in zip(cameras, self.of_views(), strict=True):
             rows, columns = np.divmod(pixels, camera.width)
             rays.append(rays_of_pixels(camera, columns, rows, 0.0))
-        rays_o, rays_d = (np.concatenate(column) for column in zip(*rays, strict=True))
+        whole = np.empty(
+            (2, len(self.pixels), 3), np.float32
+        )  # rows are contiguous, whatever those of a view are
+        rays_o, rays_d = (
+            np.concatenate(column, out=out)
+            for column, out in zip(zip(*rays, strict=True), whole, strict=True)
+        )
         return rays_o, rays_d
 
     def chosen(self: SomePixels, kept: np.ndarray) -> SomePixels:

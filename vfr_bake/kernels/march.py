@@ -110,7 +110,7 @@ def march_samples(
                 break
             starts[ray] = k
             tau = kind(0)
-            i = 0
+            i = np.int64(0)
             while tau <= limits.opaque_depth:
                 i, t, ux, uy, uz = next_sample(
                     rays_o, rays_d, ray, t_near, t_far, i, jitter[ray], step, distance
@@ -144,7 +144,7 @@ def render_features(rays_o, rays_d, step, distance, field, limits, out, opacity)
             t_near, t_far = ray_box(rays_o, rays_d, ray)
             tau = kind(0)
             trans = kind(1)
-            i = 0
+            i = np.int64(0)
             while tau <= limits.opaque_depth:
                 i, _, ux, uy, uz = next_sample(rays_o, rays_d, ray, t_near, t_far, i, half, step, distance)
                 if i < 0:

@@ -31,7 +31,7 @@ def render_and_mark(rays_o, rays_d, step, distance, field, limits, weight_floors
         for ray in range(start * block, min((start + 1) * block, n_rays)):
             t_near, t_far = ray_box(rays_o, rays_d, ray)
             tau = kind(0)
-            i = 0
+            i = np.int64(0)
             while tau <= limits.opaque_depth:
                 i, _, ux, uy, uz = next_sample(rays_o, rays_d, ray, t_near, t_far, i, half, step, distance)
                 if i < 0:
