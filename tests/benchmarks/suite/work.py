@@ -83,7 +83,10 @@ class Work:
         print(f"$ {self.commands[-1]}", file=sys.stderr, flush=True)
         begin = ["-c", COMMANDS[name]] if name in COMMANDS else ["-m", f"tests.benchmarks.{name}"]
         start = time.monotonic()
-        process = subprocess.Popen([sys.executable, *begin, *words], cwd=REPOSITORY, stdout=sys.stderr)
+        environment = os.environ | {"PYTHONDONTWRITEBYTECODE": ""}  # there is, where pip installs
+        process = subprocess.Popen(
+            [sys.executable, *begin, *words], cwd=REPOSITORY, stdout=sys.stderr, env=environment
+        )
         _, status, usage = os.wait4(process.pid, 0)
         process.returncode = os.waitstatus_to_exitcode(status)
         if process.returncode:
