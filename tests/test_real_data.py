@@ -12,6 +12,7 @@ from PIL import Image
 
 from exporters.cli import main as export
 from player.app.cli import main as play
+from tests.vfr_bake.fewer_rays import fewer_rays
 from vfr_bake.cli import bake_main, eval_main, train_main
 from vfr_bake.training.scores.metrics import over_background, psnr
 
@@ -21,24 +22,14 @@ SHORT = [
     *("--occupancy-resolution", "64"),
 ]  # fmt: skip
 
-N_WITNESSES = 15_000
-"""Number of witnesses, a quarter of those that a training keeps apart, because a bake plays all of them for
-each of its choices."""
-N_RAYS, N_SEEING = 100_000, 500_000
-"""Numbers of rays from which a bake learns how much each stored value matters, and which cells are seen:
-fewer than by default."""
-
 
 @pytest.fixture(scope="module")
 def out(lego_400: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder with the model, the asset and the frames of a shortened run."""
     out = tmp_path_factory.mktemp("lego")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("vfr_bake.data.witnesses.N_WITNESSES", N_WITNESSES)
-        patch.setattr("vfr_bake.baking.rate.importance.N_RAYS", N_RAYS)
-        patch.setattr("vfr_bake.baking.detail.detail.N_SEEING", N_SEEING)
+    with fewer_rays():
         assert train_main([str(lego_400), str(out / "model.pt"), *SHORT]) == 0
-        settings = ["--mesh-resolution", "64", "--refine-steps", "60"]
+        settings = ["--mesh-resolution", "64", "--refine-steps", "30"]
         assert bake_main([str(out / "model.pt"), str(out / "asset"), *settings]) == 0
     cameras = str(lego_400 / "transforms_test.json")
     options = ["--frames", "0:200:100", "--json", str(out / "play.json")]

@@ -14,6 +14,7 @@ from player.app.cli import main as play
 from player.asset.asset import Asset
 from player.cameras.views import asset_cameras
 from player.render import Renderer
+from tests.vfr_bake.fewer_rays import fewer_rays
 from vfr_bake.cli import bake_main, train_main
 from vfr_bake.data import load_scene
 from vfr_bake.rendering.render import render_image
@@ -36,18 +37,9 @@ TRAIN = [
     *("--n-levels", "8", "--max-resolution", "512", "--log2-table-size", "15", "--head-width", "32"),
 ]
 BAKE = [
-    *("--resolution", "192", "--feature-resolution", "160", "--refine-steps", "40", "--check-views", "1"),
+    *("--resolution", "192", "--feature-resolution", "160", "--refine-steps", "20", "--check-views", "1"),
     *("--mesh-resolution", "48", "--max-memory", "1.4", "--head-width", "0", "--weight-floor", "0.01"),
 ]
-
-N_WITNESSES = 15_000
-"""Number of witnesses, a quarter of those that a training keeps apart, because a bake plays all of them for
-each of its choices."""
-N_RAYS = 20_000
-"""Number of rays from which a bake learns how much each stored value matters, and what coarser levels show.
-It is small because a ray through a model that was trained so briefly has a hundred samples."""
-N_SEEING = 300_000
-"""Number of rays that find the cells that are seen: a tenth of all pixels."""
 
 
 @pytest.fixture(scope="module")
@@ -55,11 +47,7 @@ def out(fox: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder with the model, the asset and one training view, played."""
     out = tmp_path_factory.mktemp("fox")
     model, asset = str(out / "model.pt"), str(out / "asset")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("vfr_bake.data.witnesses.N_WITNESSES", N_WITNESSES)
-        patch.setattr("vfr_bake.baking.rate.importance.N_RAYS", N_RAYS)
-        patch.setattr("vfr_bake.baking.detail.detail.N_COMPARED", N_RAYS)
-        patch.setattr("vfr_bake.baking.detail.detail.N_SEEING", N_SEEING)
+    with fewer_rays():
         assert train_main([str(fox), model, *TRAIN, "--json", str(out / "train.json")]) == 0
         assert bake_main([model, asset, *BAKE, "--json", str(out / "bake.json")]) == 0
     view = ["--view", "0", "--output", str(out / "view.png"), "--json", str(out / "play.json")]

@@ -6,6 +6,7 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import dataclass
+from functools import cached_property, lru_cache
 
 import numpy as np
 
@@ -96,7 +97,7 @@ class Reading:
         return np.zeros(self.n_channels), 0.0
 
 
-@dataclass
+@dataclass(eq=False)
 class PyramidScene:
     """Two pyramids, the settings of their march, and the grid that a player makes of them."""
 
@@ -107,8 +108,13 @@ class PyramidScene:
     contracted: bool = False
     density_range: tuple[float, float] = (-2.0, 4.0)
 
-    def __post_init__(self) -> None:
-        self.code, self.feature = Reading(self.densities), Reading(self.features)
+    @cached_property
+    def code(self) -> Reading:
+        return Reading(self.densities)
+
+    @cached_property
+    def feature(self) -> Reading:
+        return Reading(self.features)
 
     @property
     def grid(self) -> SparseGrid:
@@ -209,6 +215,7 @@ def random_pyramid(resolution: int, n_levels: int, seed: int) -> Pyramid:
     return whole_pyramid(resolution, leaves)
 
 
+@lru_cache(16)
 def random_scene(
     resolution: int,
     feature_resolution: int,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from types import ModuleType
 
 import numpy as np
@@ -37,12 +38,16 @@ def rays(n: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
     return rays_o.astype(np.float32), rays_d.astype(np.float32)
 
 
+@lru_cache(4)  # both marches are compared with one result
+def naive(scene: PyramidScene, k: int, n: int) -> list[tuple[float, float, int, np.ndarray]]:
+    return [scene.march(o, d, k) for o, d in zip(*rays(n), strict=True)]
+
+
 def compare(scene: PyramidScene, module: ModuleType, k: int, n: int = 60) -> int:
     """Compare a march of rays with the naive loop; return how many rays hit."""
     rays_o, rays_d = rays(n)
     result = module.march(scene.grid, rays_o, rays_d, k)
-    expected = [scene.march(o, d, k) for o, d in zip(rays_o, rays_d, strict=True)]
-    opacity, depth, taken, features = zip(*expected, strict=True)
+    opacity, depth, taken, features = zip(*naive(scene, k, n), strict=True)
     assert result.n_density_samples.tolist() == list(taken)
     np.testing.assert_allclose(result.opacity, opacity, rtol=0, atol=2e-5)
     assert result.hits.tolist() == [i for i, a in enumerate(opacity) if a > MIN_OPACITY]
@@ -81,6 +86,7 @@ def full(resolution: int, level: int) -> np.ndarray:
     return np.argwhere(np.ones((-(-resolution // 2**level),) * 3, bool))
 
 
+@lru_cache
 def shapes(resolution: int) -> dict[str, Pyramid]:
     """Return pyramids that fill the box, by name."""
     none, middle = np.zeros((0, 3), int), np.full(3, 0.5)

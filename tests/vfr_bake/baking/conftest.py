@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import pytest
 
 from tests.vfr_bake.baking.scenes import trained
+from tests.vfr_bake.fewer_rays import fewer_rays
 from vfr_bake.config import FieldOptions, TrainConfig
 from vfr_bake.data import demo
 from vfr_bake.training.model_file import Model
@@ -19,6 +21,13 @@ SMALL: dict[str, Any] = {
     "check_views": 1,
 }
 """Settings of a bake that takes a second."""
+
+
+@pytest.fixture(scope="module", autouse=True)
+def few_rays() -> Iterator[None]:
+    """Let each bake take a few seconds: these scenes have a hundredth of a real one's pixels."""
+    with fewer_rays():
+        yield
 
 
 @pytest.fixture(scope="session")  # files of other folders may run between two of this one

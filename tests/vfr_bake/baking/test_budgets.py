@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import gc
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -59,6 +59,36 @@ from vfr_bake.kernels import SOURCES
 from vfr_bake.presets import PRESETS, Preset
 from vfr_bake.training.length.witness_loss import Loss
 from vfr_bake.training.model_file import Model
+
+REFINED = SMALL | {"refine_steps": 1}
+
+
+@dataclass(frozen=True)
+class Baked:
+    """A small asset that was baked with a step of refinement."""
+
+    folder: Path
+    held_before: list[str]
+    """Types of the refined values and layouts that were there before the bake."""
+    held_by_mesh: list[str]
+    """Types of those that were there when the mesh was made."""
+
+
+@pytest.fixture(scope="module")
+def baked(model: Model, tmp_path_factory: pytest.TempPathFactory) -> Baked:
+    def held() -> list[str]:
+        return [type(o).__name__ for o in gc.get_objects() if type(o) in (Stored, Layout)]
+
+    def mesh(*arguments: Any) -> Any:
+        result.held_by_mesh.extend(held())
+        return bake_mesh(*arguments)
+
+    gc.collect()
+    result = Baked(tmp_path_factory.mktemp("budgets") / "asset", held(), [])
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("vfr_bake.baking.bake.bake_mesh", mesh)
+        bake(model, result.folder, BakeConfig(**REFINED), silent)
+    return result
 
 
 @pytest.fixture(autouse=True)
@@ -143,10 +173,9 @@ def test_a_head_that_was_timed_in_8_bits_keeps_them(
     assert (tuning.ranges is None) == (target_ms is None)
 
 
-def test_time_that_is_left_changes_nothing(model: Model, tmp_path: Path) -> None:
-    bake(model, tmp_path / "a", BakeConfig(**SMALL), silent)
-    bake(model, tmp_path / "b", BakeConfig(target_ms=1e6, **SMALL), silent)
-    a, b = (Asset.open(tmp_path / name).manifest for name in "ab")
+def test_time_that_is_left_changes_nothing(model: Model, baked: Baked, tmp_path: Path) -> None:
+    bake(model, tmp_path / "b", BakeConfig(target_ms=1e6, **REFINED), silent)
+    a, b = (Asset.open(folder).manifest for folder in (baked.folder, tmp_path / "b"))
     assert (a.n_fetches, a.files["head.onnx"].bytes) == (b.n_fetches, b.files["head.onnx"].bytes)
 
 
@@ -251,24 +280,9 @@ def test_few_steps_are_given_no_more_rays_than_they_draw(model: Model) -> None:
     assert found == [FEW_DRAWN, int(RAYS_OF_DRAW * 400 * BATCH), N_RAYS]
 
 
-def test_what_was_refined_is_gone_when_the_mesh_is_made(
-    model: Model, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_was_refined_is_gone_when_the_mesh_is_made(baked: Baked) -> None:
     """What was refined is freed before the mesh is made: for lego it would take a gigabyte of the four."""
-    alive = []
-
-    def held() -> list[str]:
-        return [type(o).__name__ for o in gc.get_objects() if type(o) in (Stored, Layout)]
-
-    def mesh(*arguments: Any) -> Any:
-        alive.extend(held())
-        return bake_mesh(*arguments)
-
-    gc.collect()
-    before = held()
-    monkeypatch.setattr("vfr_bake.baking.bake.bake_mesh", mesh)
-    bake(model, tmp_path / "asset", BakeConfig(**SMALL), silent)
-    assert len(alive) <= len(before), alive
+    assert len(baked.held_by_mesh) <= len(baked.held_before), baked.held_by_mesh
 
 
 @pytest.mark.parametrize("preset", PRESETS)
@@ -297,12 +311,11 @@ def test_a_grid_that_the_plan_made_coarser_is_reported(model: Model) -> None:
     assert f"into {work.config.memory:.3g} GB of memory;" in work.left_out["resolution"]
 
 
-def test_a_mesh_that_takes_too_much_memory_is_left_out(model: Model, tmp_path: Path) -> None:
-    bake(model, tmp_path / "asset", BakeConfig(**SMALL), silent)
-    asset = Asset.open(tmp_path / "asset")
+def test_a_mesh_that_takes_too_much_memory_is_left_out(baked: Baked) -> None:
+    asset = Asset.open(baked.folder)
     assert len(asset.arrays.densities.pyramid.levels) > 1
-    baked = bake_mesh(asset, 16, 100_000, 1e-6, silent)
-    assert not len(baked.mesh.faces) and "more than 1e-06 GB of memory" in (baked.left_out or "")
+    found = bake_mesh(asset, 16, 100_000, 1e-6, silent)
+    assert not len(found.mesh.faces) and "more than 1e-06 GB of memory" in (found.left_out or "")
     assert bake_mesh(asset, 16, 100_000, 1.0, silent).left_out is None
 
 
@@ -401,8 +414,8 @@ def test_the_first_bake_is_expected_to_compile(model: Model, monkeypatch: pytest
     assert expected_seconds(model, config, plan) == COMPILE_SECONDS
 
 
-def test_what_a_bake_compiles_is_kept(model: Model, tmp_path: Path) -> None:
-    bake(model, tmp_path / "asset", BakeConfig(**(SMALL | {"refine_steps": 1})), silent)
+@pytest.mark.usefixtures("baked")
+def test_what_a_bake_compiles_is_kept() -> None:
     assert is_compiled() and not is_kept("no such kernel", *SOURCES)
 
 

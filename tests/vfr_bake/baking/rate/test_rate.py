@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise, product
 
 import numpy as np
@@ -16,7 +17,7 @@ from tests.player.asset.coder.oracle import context
 from vfr_bake.baking import bake
 from vfr_bake.baking.coarser_levels import pyramid_beneath
 from vfr_bake.baking.detail.shown import Wanted, mean_values
-from vfr_bake.baking.distillation import collect_training_rays
+from vfr_bake.baking.distillation import TrainingRays, collect_training_rays
 from vfr_bake.baking.grids import latent, whole_codes
 from vfr_bake.baking.head import runner
 from vfr_bake.baking.rate.choices import Choices, bits_of, first_bits
@@ -212,23 +213,26 @@ def test_importance_is_the_mean_square_of_derivatives(model: Model) -> None:
     assert found.channels.sum() == pytest.approx(1) and (found.channels > 0).all()
     assert (found.features >= 0).all() and (found.densities >= 0).all()
     rays = collect_training_rays(teacher, grid, 0)
-    head = runner(stored.head)
+    head, fetches = runner(stored.head), rays.fetches(np.arange(len(rays)))
 
-    def colours(features: np.ndarray) -> np.ndarray:
-        composed, opacity = rays.composed(features)
-        rgb = head(composed, rays.teacher.rays_d).astype(np.float64) - model.background
+    def colours(features: np.ndarray, of: TrainingRays) -> np.ndarray:
+        composed, opacity = of.composed(features)
+        rgb = head(composed, of.teacher.rays_d).astype(np.float64) - model.background
         return rgb * opacity[:, None]
 
     # Ranks are denser at the top, where importance falls fastest; it has to differ by more than its error.
     ranks = np.union1d(np.geomspace(1, 400, 14).astype(int), np.arange(40, 400, 40))
     some, codes = np.argsort(found.features)[-ranks], whole_codes(stored.features)
-    changes, base = [], colours(latent(codes))
+    changes = []
     for row in some:
-        total = 0.0
+        at = np.flatnonzero((fetches.features.rows == row).any(axis=1))  # other rays' colours do not change
+        near = np.unique(np.searchsorted(fetches.starts, at, side="right") - 1)
+        meeting = replace(rays, teacher=rays.teacher.chosen(near), kept=None)
+        total, base = 0.0, colours(latent(codes), meeting)
         for channel in range(stored.features.shape[1]):
             moved = codes.copy()
             moved[row, channel] += 1
-            total += float(((colours(latent(moved)) - base) ** 2).mean())
+            total += float(((colours(latent(moved), meeting) - base) ** 2).sum()) / (3 * len(rays))
         changes.append(total)
     # Signs are random: a vertex that some hundred rays meet is known to a fifth, all together better.
     assert found.features[some].sum() == pytest.approx(np.sum(changes), rel=0.2)
