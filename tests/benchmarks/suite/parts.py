@@ -14,10 +14,10 @@ LEGO, FOX, CAN, DEMO = (SCENES[name] for name in ("lego", "fox", "can", "demo"))
 LONGEST_PART, LONGEST_CORE = 120.0, 150.0
 """Minutes that a part, and all parts of the core together, may take on two cores."""
 PRESETS = {
-    "lego": {"fidelity": 4.5, "balanced": 5.5, "fast": 5.0, "phone": 6.0},
+    "lego": {"fidelity": 7.0, "balanced": 7.0, "fast": 6.0, "phone": 5.0},
     "fox": {"balanced": 9.5, "phone": 7.5},
     "can": {"balanced": 9.0},
-    "demo": {"balanced": 5.0},
+    "demo": {"balanced": 7.0},
 }
 """Presets with which each scene is baked, and the minutes of each, like all parts' without AVX-512."""
 LIMITS_MB = ("1", "2", "3")
@@ -133,7 +133,6 @@ def _core() -> list[Part]:
         *presets,
         _trade("trade_lego", LEGO, bakes(LEGO), 11.0),
         _trade("trade_fox", FOX, bakes(FOX), 6.0),
-        _trade("trade_can", CAN, bakes(CAN), 7.5),
         _trade("trade_demo", DEMO, bakes(DEMO), 1.5),
         *(
             _play(scene, name, of)
@@ -155,6 +154,7 @@ def _more() -> list[Part]:
         *(_bake(f"bytes_lego_{mb}", "train_lego", 5.5, "--max-mb", mb, core=False) for mb in LIMITS_MB),
         *(part for minutes in MINUTES for part in _shorter(minutes)),
         *dials,
+        _trade("trade_can", CAN, bakes(CAN), 7.5, core=False),
         _trade("trade_dials", LEGO, dialled, 8.0, core=False),
         *_lookups(LEGO, 25.0),
         *_lookups(FOX, 25.0),
