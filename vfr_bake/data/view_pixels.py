@@ -50,12 +50,10 @@ class ViewPixels:
         for camera, pixels in zip(cameras, self.of_views(), strict=True):
             rows, columns = np.divmod(pixels, camera.width)
             rays.append(rays_of_pixels(camera, columns, rows, 0.0))
-        whole = np.empty(
-            (2, len(self.pixels), 3), np.float32
-        )  # rows are contiguous, whatever those of a view are
+        # Concatenated as they are, origins would not be contiguous: those of a view are one row, repeated.
         rays_o, rays_d = (
-            np.concatenate(column, out=out)
-            for column, out in zip(zip(*rays, strict=True), whole, strict=True)
+            np.concatenate(column, out=np.empty((len(self.pixels), 3), np.float32))
+            for column in zip(*rays, strict=True)
         )
         return rays_o, rays_d
 

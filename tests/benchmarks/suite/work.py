@@ -83,7 +83,8 @@ class Work:
         print(f"$ {self.commands[-1]}", file=sys.stderr, flush=True)
         begin = ["-c", COMMANDS[name]] if name in COMMANDS else ["-m", f"tests.benchmarks.{name}"]
         start = time.monotonic()
-        environment = os.environ | {"PYTHONDONTWRITEBYTECODE": ""}  # there is, where pip installs
+        # As for users: pip writes the bytecode of what it installs.
+        environment = os.environ | {"PYTHONDONTWRITEBYTECODE": ""}
         process = subprocess.Popen(
             [sys.executable, *begin, *words], cwd=REPOSITORY, stdout=sys.stderr, env=environment
         )
