@@ -48,9 +48,10 @@ FRAME_BYTES = 30
 """Memory of a frame in bytes per pixel: 12 for colour, 4 each for opacity, depth and samples, and 6 for its
 8-bit picture and the arrays that round to it."""
 
-TASK_BLOCKS = {"numba": 256, "numpy": 128}
-"""Most blocks of a task. What Python does for a task takes as long as the compiled march of ten blocks; numpy
-arrays of more blocks do not stay in cache."""
+TASK_BLOCKS = 256
+"""Most blocks of a task. What Python does for a task takes as long as the compiled march of ten blocks. In
+numpy, threads wait for each other between calls, and smaller tasks need more calls; larger ones gain little,
+and take more memory."""
 TASKS_A_THREAD = {"numba": 8, "numpy": 1}
 """Least number of tasks per thread, if there are enough blocks, so that the work is shared out evenly. For
 numpy it is 1: a call of numpy takes as long for ten rays as for a hundred, and threads wait for one another
@@ -267,7 +268,7 @@ class Renderer:
     def _tasks(self, blocks: np.ndarray, n_pixels: int) -> list[np.ndarray]:
         """Divide blocks into tasks; `n_pixels` pixels of each block are computed at a time."""
         size = min(
-            TASK_BLOCKS[self.march] * len(EVERY) // n_pixels,
+            TASK_BLOCKS * len(EVERY) // n_pixels,
             max(len(blocks) // (TASKS_A_THREAD[self.march] * self.n_threads), 16),
         )
         return [blocks[i : i + size] for i in range(0, len(blocks), size)]

@@ -51,11 +51,11 @@ class BoxPath(NamedTuple):
     def jump(
         self, ray: np.ndarray, i: np.ndarray, g: np.ndarray, brick: np.ndarray, reach: np.ndarray
     ) -> np.ndarray:
-        direction = self.direction[:, ray]
+        direction = self.direction.take(ray, axis=1)
         ahead, behind = (brick + (reach + 1)) * 8 - SKIP_MARGIN, (brick - reach) * 8 + SKIP_MARGIN
         still = direction == 0
         face = np.where(direction > 0, ahead, behind).astype(np.float32)
-        s = (face - self.point[:, ray]) / np.where(still, np.float32(1), direction)
+        s = (face - self.point.take(ray, axis=1)) / np.where(still, np.float32(1), direction)
         s[still] = np.inf
         # s is far below 0 where the point is within the margin of a face that the ray is nearly parallel to
         left = np.clip(s.min(axis=0), np.float32(0), np.float32(1e6)) / self.step - np.float32(0.5)
@@ -65,7 +65,7 @@ class BoxPath(NamedTuple):
         return size.astype(np.float32) * self.step
 
     def at(self, ray: np.ndarray, s: np.ndarray) -> np.ndarray:
-        return self.point[:, ray] + s * self.direction[:, ray]
+        return self.point.take(ray, axis=1) + s * self.direction.take(ray, axis=1)
 
     def distances(self, ray: np.ndarray, s: np.ndarray) -> np.ndarray:
         return self.t[ray] + s

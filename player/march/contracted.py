@@ -108,7 +108,7 @@ class ContractedPath(NamedTuple):
 
     def _direction(self, ray: np.ndarray, cos: np.ndarray, sin: np.ndarray) -> np.ndarray:
         """Return v [3, ...]; the points at the angles phi are v / cos, model frame."""
-        return cos * self.nearest[:, ray] + sin * self.along[:, ray]
+        return cos * self.nearest.take(ray, axis=1) + sin * self.along.take(ray, axis=1)
 
     def _on_grid(self, ray: np.ndarray, cos: np.ndarray, sin: np.ndarray) -> np.ndarray:
         """Return grid coordinates [3, ...] (cells) of the points at the angles phi."""

@@ -24,8 +24,11 @@ from player.march.path import Path
 MIN_TOTAL = np.float32(1e-3)
 """Least sum of the interpolation weights of stored corners with which a point counts as stored."""
 
-BLOCK = 4096
-"""Fetches that are processed at a time: the rows that they gather stay in the second-level cache."""
+CORNERS = np.array([x * 81 + y * 9 + z for x, y, z in np.ndindex(2, 2, 2)])
+"""Places of the corners of a cell in a brick with an apron, relative to the lowest corner."""
+
+BLOCK = 8192
+"""Fetches that are processed at a time: more need fewer calls of numpy, fewer stay in the caches."""
 
 
 class Samples(NamedTuple):
@@ -200,14 +203,14 @@ def stored_features(grid: SparseGrid, g: np.ndarray) -> tuple[np.ndarray, np.nda
     level = np.maximum(held, 0) & 7
     low >>= level
     fraction = g * CELLS_OF_LEVELS.take(level) - low.astype(np.float32)
-    at = corner_number(held >> 3, low)
-    share = [(np.float32(1) - side, side) for side in fraction]
+    near = corner_number(held >> 3, low) + CORNERS[:, None]
+    rows = np.where(held >= 0, vertices.rows.take(near), -1)
+    (x0, y0, z0), (x1, y1, z1) = np.float32(1) - fraction, fraction
+    edges = [x0 * y0, x0 * y1, x1 * y0, x1 * y1]
     values = np.zeros((g.shape[1], grid.n_channels), np.float32)
     total = np.zeros(g.shape[1], np.float32)
-    for x, y, z in np.ndindex(2, 2, 2):
-        row = vertices.rows.take(at + (x * 81 + y * 9 + z))
-        stored = (held >= 0) & (row >= 0)
-        weight = share[0][x] * share[1][y] * share[2][z] * stored
-        values += weight[:, None] * grid.features.take(np.where(stored, row, 0), axis=0)
+    for corner, row in enumerate(rows):
+        weight = edges[corner >> 1] * (z1 if corner & 1 else z0) * (row >= 0)
+        values += weight[:, None] * grid.features.take(row, axis=0, mode="clip")
         total += weight
     return values, total

@@ -28,12 +28,13 @@ them from the ray's p, w d, cos(phi_0) and sin(phi_0) and from the lattice's tab
 
 from __future__ import annotations
 
+import itertools
 from typing import NamedTuple
 
 import numpy as np
 
 from player.asset.grid import MAX_DISTANCE, LocatedPoints, SparseGrid
-from player.march.box import ONE, Bounds
+from player.march.box import Bounds
 from player.march.fetches import Samples, fetch_features
 from player.march.path import Path, path_of
 
@@ -156,17 +157,16 @@ def sample_rays(
 
 
 class Chunk(NamedTuple):
-    """Samples of n rays that may be in live cells, ray after ray, in the order of the march."""
+    """Samples of n rays that may be in live cells: each ray's samples are in the order of the march."""
 
-    row: np.ndarray
-    """[n_samples] int64: the ray of each sample, as an index into the n rays."""
     column: np.ndarray
     """[n_samples] int64: the base step with which each sample begins, as an index into CHUNK."""
+    row: np.ndarray
+    """[n_samples] int64: the ray of each sample, as an index into the n rays."""
     i: np.ndarray
     """[n_samples] int32: the number of this base step on the sample's ray."""
     size: np.ndarray
-    """[n_samples] int32: the number of base steps that each sample stands for; a single number if all are
-    alike."""
+    """[n_samples] int32: the number of base steps that each sample stands for."""
     s: np.ndarray
     """[n_samples] float32: positions on the rays."""
     found: LocatedPoints
@@ -177,24 +177,19 @@ class Chunk(NamedTuple):
 
 def _chunk(grid: SparseGrid, path: Path, ray: np.ndarray, i: np.ndarray) -> Chunk:
     """Find the samples that begin in the len(CHUNK) base steps of each ray from `i` [n] on."""
-    steps = i[:, None] + CHUNK
-    s, g = path.sample(steps), path.place(ray[:, None], steps)
-    found, after = grid.find(g), i + len(CHUNK)
-    if grid.level_steps[-1] == 1:
-        row, column = np.divmod(np.arange(steps.size), len(CHUNK))
-        flat = LocatedPoints(*(array.reshape(*array.shape[:-2], -1) for array in found))
-        return Chunk(row, column, steps.reshape(-1), ONE, s.reshape(-1), flat, after)
-    sizes = group_size(grid, steps, found.entries)
-    begins = np.zeros(steps.shape, bool)
-    then = i
-    for column, here in enumerate(steps.T):
-        at = then == here
-        begins[:, column] = at & ((found.entries[:, column] >= 0) | (sizes[:, column] > 1))
-        then = np.where(at, here + sizes[:, column], then)
-    row, column = np.nonzero(begins)
-    i, size = steps[row, column], sizes[row, column]
+    steps = i + CHUNK[:, None]
+    entries = grid.entries(grid.cells(path.place(ray[None], steps)))
+    sizes = group_size(grid, steps, entries)
+    begins, after = np.empty(steps.shape, bool), i
+    for here, size, entry, begin in zip(steps, sizes, entries, begins, strict=True):
+        at = after == here
+        np.logical_and(at, (entry >= 0) | (size > 1), out=begin)
+        after = np.where(at, here + size, after)
+    chosen = np.flatnonzero(begins)
+    column, row = np.divmod(chosen, len(ray))
+    i, size = steps.reshape(-1)[chosen], sizes.reshape(-1)[chosen]
     found = grid.find(path.place(ray[row], i, size))
-    return Chunk(row, column, i, size, path.sample(i, size), found, np.maximum(then, after))
+    return Chunk(column, row, i, size, path.sample(i, size), found, after)
 
 
 def group_size(grid: SparseGrid, i: np.ndarray, entries: np.ndarray) -> np.ndarray:
@@ -232,20 +227,20 @@ def _take(
     passes `opaque_depth`. That sample counts as opaque if `opaque_depth` is below MAX_TAU. `tau` [n_rays] is
     updated."""
     at = np.flatnonzero(chunk.found.live & (chunk.s < path.length[ray][chunk.row]))
-    row, column, i, s = (array[at] for array in (chunk.row, chunk.column, chunk.i, chunk.s))
-    size = chunk.size[at] if chunk.size.ndim else chunk.size
-    found = LocatedPoints(*(array[..., at] for array in chunk.found))
+    column, row, i, size, s = (array[at] for array in chunk[:5])
+    found = LocatedPoints(*(array.take(at, axis=-1) for array in chunk.found))
     code = trilinear(grid.density, found.corners, found.fractions)
-    way = np.broadcast_to(path.way(ray[row], i, size), s.shape)
+    way = path.way(ray[row], i, size)
     optical = np.exp(grid.density_low + grid.density_slope * code) * way
-    added = np.zeros((len(ray), len(CHUNK) + 1), np.float32)
-    added[:, 0] = tau[ray]
-    added[row, column + 1] = optical
-    running = np.cumsum(added, axis=1, dtype=np.float32)
-    before = running[row, column]
+    running = np.zeros((len(CHUNK) + 1, len(ray)), np.float32)
+    running[0] = tau[ray]
+    running[column + 1, row] = optical
+    for above, here in itertools.pairwise(running):
+        here += above
+    before = running[column, row]
     kept = before <= opaque_depth
     row, column, optical = row[kept], column[kept], optical[kept]
-    after = running[row, column + 1]
+    after = running[column + 1, row]
     if opaque_depth < MAX_TAU:
         last = after > opaque_depth
         after[last] = optical[last] = np.inf

@@ -111,7 +111,7 @@ def test_threads_and_tasks_do_not_change_a_bit(
 ) -> None:
     frames = []
     for n_threads, blocks in ((1, 1000), (2, 7), (3, 1)):
-        monkeypatch.setitem(render_module.TASK_BLOCKS, module, blocks)
+        monkeypatch.setattr("player.render.TASK_BLOCKS", blocks)
         with Renderer(asset, n_threads, module) as renderer:  # type: ignore[arg-type]
             frames.append(renderer.render(camera.resized(101, 83)))
     for frame in frames[1:]:

@@ -311,7 +311,7 @@ def test_threads_and_tasks_do_not_change_a_bit(
 ) -> None:
     frames = []
     for n_threads, blocks in ((1, 1000), (2, 7), (3, 1)):
-        monkeypatch.setitem(__import__("player.render").render.TASK_BLOCKS, march, blocks)
+        monkeypatch.setattr("player.render.TASK_BLOCKS", blocks)
         with Renderer(asset, n_threads, march) as renderer:  # type: ignore[arg-type]
             frames += [renderer.render(camera, quality=quality) for _ in range(2)]
     for frame in frames[1:]:
