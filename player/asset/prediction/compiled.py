@@ -29,8 +29,8 @@ def add_to_prediction(
         coarse_bricks: [n_bricks, 4] int32: for each brick, the index of the coarser brick around it in
             `coarse_rows`, and where in that one it begins along each axis, 0 or 4.
         coarse_rows: [n_coarse_bricks * 729] int32: the rows of the coarser level's vertices.
-        coarse: [n_coarse, n_channels] values of the coarser level.
-        symbols: [n_stored, n_channels] int16, contiguous channel by channel; [0, n_channels] if all are 0.
+        coarse: [n_coarse, n_channels] values of the coarser level, in the dtype of `out`.
+        symbols: [n_channels, n_stored] int16; [n_channels, 0] if all are 0.
         limits: the step, the lowest and the highest value.
         sums: [n_channels] int32, scratch memory for sums.
         out: [n, n_channels], written here.
@@ -61,9 +61,9 @@ def add_to_prediction(
                         + np.int32(coarse[g, i]) + np.int32(coarse[h, i])
                     )  # fmt: skip
                     sums[i] = (total + 4) >> 3
-                if len(symbols) and not (at_border >> np.uint64(bit)) & np.uint64(1):
+                if symbols.shape[1] and not (at_border >> np.uint64(bit)) & np.uint64(1):
                     for i in range(n_channels):
-                        sums[i] = min(max(sums[i] + step * np.int32(symbols[stored, i]), low), high)
+                        sums[i] = min(max(sums[i] + step * np.int32(symbols[i, stored]), low), high)
                     stored += 1
                 for i in range(n_channels):
                     out[row, i] = sums[i]

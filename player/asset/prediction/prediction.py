@@ -54,9 +54,10 @@ def values_from(
     out = np.empty((n, coarse.shape[1]), dtype)
     if available():
         sums = np.empty(coarse.shape[1], np.int32)
+        # arrays of one dtype and layout: numba compiles once for each kind of arrays
         add_to_prediction(
-            masks, border, places.bricks, places.rows, np.ascontiguousarray(coarse),
-            np.asfortranarray(symbols, np.int16), (step, *limits), sums, out,
+            masks, border, places.bricks, places.rows, np.ascontiguousarray(coarse, dtype),
+            np.ascontiguousarray(symbols.T, np.int16), (step, *limits), sums, out,
         )  # fmt: skip
         return out
     row = first_symbol = 0
