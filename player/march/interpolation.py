@@ -149,7 +149,9 @@ def interpolate(
     if transparent:
         rgb = rgb * opacity[..., None]
     allowed = stage.agreement
-    known = inside & (_spread(rgb).max(axis=-1) <= allowed.colour) & (_spread(opacity) <= allowed.opacity)
+    red, green, blue = _spread(rgb).T  # three columns: several times as fast as .max(axis=-1)
+    widest = np.maximum(np.maximum(red, green), blue)
+    known = inside & (widest <= allowed.colour) & (_spread(opacity) <= allowed.opacity)
     nearest = depth.min(axis=0)
     known &= (_spread(depth) <= allowed.depth * nearest) | (opacity.max(axis=0) <= allowed.opacity)
     at = (pixels.rows * width + pixels.columns)[known]
