@@ -188,7 +188,8 @@ USED_BY = {
 def parse(argv: list[str] | None) -> argparse.Namespace:
     """Read the command line. Wrong usage raises SystemExit, as argparse does."""
     parser = make_parser()
-    arguments = parser.parse_args(joined_negatives(sys.argv[1:] if argv is None else argv, "--frames"))
+    words = joined_negatives(sys.argv[1:] if argv is None else argv, "--frames")
+    arguments = parser.parse_intermixed_args(words)  # assets may stand between options
     _check_together(parser, arguments)
     return arguments
 

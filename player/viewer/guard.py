@@ -102,9 +102,7 @@ class Guard:
         host = _only(headers, "Host")
         name = None if host is None else _name(host)
         if host is None or name is None or not self.answers_to(name):
-            return 403, (
-                f"Host: expected {', '.join(LOOPBACK)} or the name given with --host, got {_quoted(host)}"
-            )
+            return 403, (f"Host: expected {', '.join(LOOPBACK)}{self._others()}, got {_quoted(host)}")
         upgrade = headers.get_all("Upgrade")
         origin = _only(headers, "Origin")
         if origin is not None and origin.lower() != f"http://{host}".lower():
@@ -127,11 +125,19 @@ class Guard:
         """Return whether a request for the host `name` is meant for this server.
 
         A foreign page can make a name of its own point here, but not an address. So where other machines may
-        connect, any address is accepted, as is the name of this machine.
+        connect, any address is accepted, as is the name of this machine; with `.local` it is the name that
+        phones find it by, which no name server of the internet gives away.
         """
         if name in (*LOOPBACK, self._host):
             return True
-        return self._host not in LOOPBACK and (_is_address(name) or name == socket.gethostname().lower())
+        own = socket.gethostname().lower()
+        return self._host not in LOOPBACK and (_is_address(name) or name in (own, f"{own}.local"))
+
+    def _others(self) -> str:
+        """Return in words which other hosts are accepted."""
+        if self._host in LOOPBACK:
+            return " or the name given with --host"
+        return ", the name given with --host, a numeric address or this machine's own name"
 
 
 class GuardedConnection(ServerConnection):

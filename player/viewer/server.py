@@ -15,8 +15,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any, get_args
 
-import numpy as np
-
 from player.asset.asset import Asset
 from player.cameras.camera import focus_point, orbit, world_up
 from player.cameras.views import asset_cameras
@@ -35,13 +33,14 @@ from player.terminal import command_line, printable
 from player.threads import bounded_threads
 from player.viewer.growing import grow, tell_what_is_missing
 from player.viewer.pages import NO_PAGES, Pages
-from player.viewer.window import PictureChoices, Window
+from player.viewer.window import PictureChoices, Window, field_of_view
 
 PORT = 8080
 PORTS = 100
 """Number of ports, from PORT on, that are tried where none was asked for."""
-EVERY_ADDRESS = ("0.0.0.0", "::")
-"""The hosts that stand for all addresses of this machine."""
+EVERY_ADDRESS = {"0.0.0.0": "127.0.0.1", "::": "[::1]"}
+"""The hosts that stand for all addresses of this machine, and the address by which the machine reaches each.
+A server at `::` answers IPv6 alone."""
 
 
 @dataclass(frozen=True)
@@ -67,8 +66,8 @@ class ServeSettings:
     """Gigabytes that an asset may take when it is opened for its page; half of the machine's if None."""
 
     def __post_init__(self) -> None:
-        if self.port is not None and not 1 <= self.port <= 65535:
-            raise ConfigError(f"port: expected 1 to 65535, got {self.port}")
+        if self.port is not None and not (isinstance(self.port, int) and 1 <= self.port <= 65535):
+            raise ConfigError(f"port: expected 1 to 65535, got {self.port!r}")
         if self.samples is not None:
             object.__setattr__(self, "samples", checked_samples(self.samples))
         if self.quality is not None:
@@ -230,13 +229,13 @@ def open_windows(
     server.scene.set_up_direction(world_up(trained))
     server.initial_camera.position = first.c2w[:3, 3]
     server.initial_camera.look_at = focus
-    server.initial_camera.fov = fov = float(2 * np.arctan(first.height / 2 / first.fy))
+    server.initial_camera.fov = field_of_view(first, first.width, first.height)
     windows: dict[int, Window] = {}
     whole = threading.Lock()
 
     @server.on_client_connect
     async def _(client: Any) -> None:  # a coroutine, since CONNECTION is not set for plain functions
-        client.camera.fov = fov
+        client.camera.fov = field_of_view(first, client.camera.image_width, client.camera.image_height)
         window = Window(client, CONNECTION.get(), renderers, trained, focus, chosen, whole)
         windows[client.client_id] = window
         window.start()
@@ -297,5 +296,5 @@ def _need_viser(asset: Asset) -> None:
 def _shown(host: str) -> str:
     """Return the host for an address by which a browser on this machine reaches the viewer."""
     if host in EVERY_ADDRESS:
-        return "127.0.0.1"
+        return EVERY_ADDRESS[host]
     return f"[{host}]" if ":" in host else host

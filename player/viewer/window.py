@@ -197,7 +197,7 @@ class Window:
             handle.position = place
             handle.look_at = place - ahead * camera.c2w[:3, 2]
             handle.wxyz = quaternion((camera.c2w @ OPENGL_FROM_OPENCV)[:3, :3])
-        self._fov.value = math.degrees(2 * math.atan(camera.height / 2 / camera.fy))
+        self._fov.value = math.degrees(field_of_view(camera, handle.image_width, handle.image_height))
         self._set_fov()
 
     def _screenshot(self) -> None:
@@ -357,6 +357,18 @@ class Window:
     def _send(self, picture: np.ndarray, quality: int, state: str) -> None:
         self._client.scene.set_background_image(picture, format="jpeg", jpeg_quality=quality)
         self._state.value = state
+
+
+def field_of_view(camera: Camera, width: int, height: int) -> float:
+    """Return the vertical field of view in radians with which a window shows all that a camera sees, also if
+    the window is narrower.
+
+    >>> camera = Camera("", np.eye(4), 400, 300, 200.0, 200.0, 200.0, 150.0)
+    >>> [round(math.tan(field_of_view(camera, *size) / 2), 2) for size in ((800, 600), (300, 600))]
+    [0.75, 2.0]
+    """
+    across = camera.width / 2 / camera.fx * max(int(height), 1) / max(int(width), 1)
+    return 2 * math.atan(max(camera.height / 2 / camera.fy, across))
 
 
 def _link(index: int) -> str:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from player.app.options import PlaySettings
+from player.app.options import PlaySettings, parse
 from player.app.play import play
 from player.asset.asset import Asset
 from player.cameras.views import asset_cameras
@@ -66,3 +66,9 @@ def test_cameras_that_are_no_list_of_some_are_refused_by_name(asset: Asset, tmp_
         play(asset, [], settings)
     assert not list(tmp_path.iterdir())
     assert play(asset, [camera], settings).figures["frames"] == 1
+
+
+def test_assets_may_stand_between_options() -> None:
+    read = parse(["fidelity/", "--port", "9000", "fast/", "--samples", "4"])
+    assert (read.asset, read.others) == (Path("fidelity"), [Path("fast")])
+    assert (read.port, read.samples) == (9000, 4)

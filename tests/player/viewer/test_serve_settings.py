@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from player.errors import ConfigError
-from player.viewer.server import ServeSettings, serve
+from player.viewer.server import ServeSettings, _shown, serve
 
 
 def test_settings_of_the_viewer_are_checked_when_they_are_made() -> None:
@@ -14,6 +14,7 @@ def test_settings_of_the_viewer_are_checked_when_they_are_made() -> None:
     assert settings == ServeSettings(samples=3, background=(1.0, 1.0, 1.0))
     for wrong, message in (
         ({"port": 70000}, "port: expected 1 to 65535, got 70000"),
+        ({"port": "8080"}, "port: expected 1 to 65535, got '8080'"),
         ({"samples": -1}, "samples: expected 0"),
         ({"quality": "best"}, "quality: expected exact, high or fast, got best"),
         ({"background": "white"}, "background: expected three numbers in 0"),
@@ -26,3 +27,11 @@ def test_settings_of_the_viewer_are_checked_when_they_are_made() -> None:
             ServeSettings(**wrong)
     with pytest.raises(ConfigError, match="assets: expected at least one, got none"), serve([]):
         pass
+
+
+@pytest.mark.parametrize(
+    ("host", "address"), [("0.0.0.0", "127.0.0.1"), ("::", "[::1]"), ("::1", "[::1]"), ("studio", "studio")]
+)
+def test_the_printed_address_is_one_that_answers(host: str, address: str) -> None:
+    """A server at `::` answers IPv6 alone, so that 127.0.0.1 would be refused."""
+    assert _shown(host) == address

@@ -115,9 +115,12 @@ def test_which_names_an_address_answers_to() -> None:
     """A viewer that others may open answers to any IP address, but only to this machine's own names."""
     for host in ("0.0.0.0", "::", "192.0.2.1"):
         guard = Guard(host, "1.1.1")
-        for name in ("localhost", "192.0.2.1", "2001:db8::1", socket.gethostname().lower()):
+        own = socket.gethostname().lower()
+        for name in ("localhost", "192.0.2.1", "2001:db8::1", own, f"{own}.local"):
             assert guard.answers_to(name), (host, name)
-        assert not guard.answers_to("evil.example")
+        assert not guard.answers_to("evil.example") and not guard.answers_to("evil.local")
+        status, reason = guard.refusal("/", Headers([("Host", "evil.example")])) or (0, "")
+        assert status == 403 and "a numeric address or this machine's own name" in reason
     assert Guard("Workstation", "1.1.1").answers_to("workstation")
     assert not Guard("127.0.0.1", "1.1.1").answers_to("192.0.2.1")
 
