@@ -102,7 +102,7 @@ class Guard:
         host = _only(headers, "Host")
         name = None if host is None else _name(host)
         if host is None or name is None or not self.answers_to(name):
-            return 403, (f"Host: expected {', '.join(LOOPBACK)}{self._others()}, got {_quoted(host)}")
+            return 403, f"Host: expected {', '.join(LOOPBACK)}{self._others()}, got {_quoted(host)}"
         upgrade = headers.get_all("Upgrade")
         origin = _only(headers, "Origin")
         if origin is not None and origin.lower() != f"http://{host}".lower():
@@ -125,8 +125,8 @@ class Guard:
         """Return whether a request for the host `name` is meant for this server.
 
         A foreign page can make a name of its own point here, but not an address. So where other machines may
-        connect, any address is accepted, as is the name of this machine; with `.local` it is the name that
-        phones find it by, which no name server of the internet gives away.
+        connect, any address is accepted, as is the name of this machine, and this name with `.local`, by which
+        phones of the same network find it.
         """
         if name in (*LOOPBACK, self._host):
             return True
