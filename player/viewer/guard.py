@@ -125,8 +125,8 @@ class Guard:
         """Return whether a request for the host `name` is meant for this server.
 
         A foreign page can make a name of its own point here, but not an address. So where other machines may
-        connect, any address is accepted, as is the name of this machine, and this name with `.local`, by which
-        phones of the same network find it.
+        connect, any address is accepted, as is the name of this machine, and this name with `.local`, by
+        which phones of the same network find it.
         """
         if name in (*LOOPBACK, self._host):
             return True
