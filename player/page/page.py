@@ -110,12 +110,11 @@ def page_of_one_file(
     march: March = "auto",
 ) -> WebPage:
     """Make the same file as `page`; returns it with its sizes."""
-    n_gpu = _checked_gpu_bytes(asset, max_gpu_mb)
+    n_gpu, files = _checked_gpu_bytes(asset, max_gpu_mb), scene_files(asset)
     poster = base64.b64encode(poster_bytes(asset, n_threads, march)).decode()
     before, behind = _around_data(
         asset, title, poster=f"data:image/jpeg;base64,{poster}", advice="", img="", connect="'none'"
     )
-    files = scene_files(asset)
     n_around = len(before + data_elements(dict.fromkeys(files, b"")) + behind) - len(poster)
     return WebPage({INDEX: before + data_elements(files) + behind}, n_around, n_gpu)
 
@@ -128,7 +127,7 @@ def page_of_many_files(asset: Asset, title: str | None = None, max_gpu_mb: int |
     >>> {"index.html", "poster.jpg", "part_0.bin"} <= set(files)
     True
     """
-    n_gpu = _checked_gpu_bytes(asset, max_gpu_mb)
+    n_gpu, files = _checked_gpu_bytes(asset, max_gpu_mb), scene_files(asset)
     poster = poster_bytes(asset)
     # Another poster has another address: a browser may have kept that of an earlier export.
     address = f"{POSTER}?v={hashlib.sha256(poster).hexdigest()[:8]}"
@@ -137,7 +136,7 @@ def page_of_many_files(asset: Asset, title: str | None = None, max_gpu_mb: int |
             asset, title, poster=address, advice=_ADVICE_OF_MANY_FILES, img="'self'", connect="'self'"
         )
     )
-    return WebPage({INDEX: index, POSTER: poster, **scene_files(asset)}, len(index), n_gpu)
+    return WebPage({INDEX: index, POSTER: poster, **files}, len(index), n_gpu)
 
 
 def _around_data(

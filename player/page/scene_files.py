@@ -34,7 +34,7 @@ def scene_files(asset: Asset) -> dict[str, bytes]:
     ['manifest.json', 'cameras.json', 'head.json', 'head.bin', 'part_0.bin']
     """
     if asset.missing is not None:
-        raise FormatError(asset.missing)
+        raise FormatError(f"{asset.missing}: a page needs every part")
     manifest = asset.manifest
     head = head_data(asset_head(asset))
     files = {"cameras.json": _cameras(asset), "head.json": head.description, "head.bin": head.numbers}

@@ -45,12 +45,14 @@ export class Viewer {
     this.covered = this.pose === pose; // the poster, which shows this pose, stays until all of the scene is there
     this.touchedAt = this.before = performance.now();
     this.asked = 0; // the request for the next tick
-    // The picture that is being drawn: { sync, begin, moving, ticks: how many have come since, hidden: whether the page was }.
+    // The picture that is being drawn: { sync, begin, moving, ticks: how many have come since, hidden: whether the page was, or its canvas }.
     this.fence = null;
     new ResizeObserver(() => this.refresh()).observe(canvas);
-    document.addEventListener("visibilitychange", () => {
+    const away = () => {
       if (this.fence) this.fence.hidden = true;
-    });
+    };
+    document.addEventListener("visibilitychange", away);
+    new IntersectionObserver(([seen]) => seen.isIntersecting || away()).observe(canvas); // an iframe that is scrolled away
     this.follow(options);
     this.watch();
   }
