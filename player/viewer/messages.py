@@ -18,7 +18,7 @@ MAX_BYTES = 4096
 """Most bytes of a message; a browser's has some 250."""
 
 FAR = 1e9
-"""Largest coordinate of a camera, world units; float32 rays from further away are too coarse."""
+"""Largest coordinate of a camera in viser's frame; float32 rays from further away are too coarse."""
 
 Check = Callable[[Any], Any]
 """A function from what a client sent to the value that a control takes, or to None if it takes none."""

@@ -33,7 +33,7 @@ from player.terminal import command_line, printable
 from player.threads import bounded_threads
 from player.viewer.growing import grow, tell_what_is_missing
 from player.viewer.pages import NO_PAGES, Pages
-from player.viewer.window import PictureChoices, Window, field_of_view
+from player.viewer.window import PictureChoices, ViserFrame, Window, field_of_view
 
 PORT = 8080
 PORTS = 100
@@ -225,10 +225,11 @@ def open_windows(
     trained = asset_cameras(renderers[0].asset)
     focus = focus_point(trained)
     first = orbit(trained, 1)[0]
+    frame = ViserFrame.around(focus, first)
     server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="medium")
     server.scene.set_up_direction(world_up(trained))
-    server.initial_camera.position = first.c2w[:3, 3]
-    server.initial_camera.look_at = focus
+    server.initial_camera.position = frame.from_world(first.c2w[:3, 3])
+    server.initial_camera.look_at = frame.from_world(focus)
     server.initial_camera.fov = field_of_view(first, first.width, first.height)
     windows: dict[int, Window] = {}
     whole = threading.Lock()
@@ -236,7 +237,7 @@ def open_windows(
     @server.on_client_connect
     async def _(client: Any) -> None:  # a coroutine, since CONNECTION is not set for plain functions
         client.camera.fov = field_of_view(first, client.camera.image_width, client.camera.image_height)
-        window = Window(client, CONNECTION.get(), renderers, trained, focus, chosen, whole)
+        window = Window(client, CONNECTION.get(), renderers, trained, frame, chosen, whole)
         windows[client.client_id] = window
         window.start()
 

@@ -43,6 +43,9 @@ HANDED_OVER_SECONDS = 0.2
 """Seconds after which viser has handed a file to the connection."""
 
 
+FIRST_DISTANCE = 4.0
+"""Distance of the first view from the focus in viser's units, about that of an object's cameras."""
+
 QUALITIES = ("fast while moving", "exact", "high", "fast")
 """The options of the quality control. With the first, pictures are exact when the camera stands still."""
 
@@ -55,6 +58,28 @@ class PictureChoices(NamedTuple):
     background: Background | None
 
 
+class ViserFrame(NamedTuple):
+    """The frame in which viser moves the camera. Its keys move two units a second and its zoom ends at 0.01
+    units, so that scenes of every size have the same size in it."""
+
+    focus: np.ndarray
+    """Its origin in the world, [3]: the point that the cameras look at."""
+    unit: float
+    """Its unit in world units."""
+
+    @classmethod
+    def around(cls, focus: np.ndarray, first: Camera) -> ViserFrame:
+        """Return the frame in which a first view is `FIRST_DISTANCE` units away from the focus."""
+        distance = float(np.linalg.norm(first.c2w[:3, 3] - focus))
+        return cls(focus, distance / FIRST_DISTANCE if distance > 0 else 1.0)
+
+    def from_world(self, place: np.ndarray) -> np.ndarray:
+        return (place - self.focus) / self.unit
+
+    def to_world(self, place: np.ndarray) -> np.ndarray:
+        return self.focus + self.unit * place
+
+
 class Window:
     """The window of one client. `start` begins rendering, and `close` ends it, also when the client is
     gone."""
@@ -65,7 +90,7 @@ class Window:
         connection: GuardedConnection,
         renderers: Sequence[Renderer],
         trained: Sequence[Camera],
-        focus: np.ndarray,
+        frame: ViserFrame,
         chosen: PictureChoices,
         whole: threading.Lock,
     ) -> None:
@@ -78,7 +103,7 @@ class Window:
         self._renderers = _named(renderers)
         self._renderer = renderers[0]
         self._trained = trained
-        self._focus = focus
+        self._viser = frame
         self._pace = Pace()
         self._views: list[Camera] = []
         self._changed = threading.Condition()
@@ -191,11 +216,11 @@ class Window:
 
     def _jump(self) -> None:
         camera = self._trained[min(self._view.value, len(self._trained) - 1)]
-        place, handle = camera.c2w[:3, 3], self._client.camera
-        ahead = max(float(-camera.c2w[:3, 2] @ (self._focus - place)), 1e-3)
+        handle = self._client.camera
+        place, backwards = self._viser.from_world(camera.c2w[:3, 3]), camera.c2w[:3, 2]
         with self._client.atomic():
             handle.position = place
-            handle.look_at = place - ahead * camera.c2w[:3, 2]
+            handle.look_at = place - max(float(backwards @ place), 1e-3) * backwards
             handle.wxyz = quaternion((camera.c2w @ OPENGL_FROM_OPENCV)[:3, :3])
         self._fov.value = math.degrees(field_of_view(camera, handle.image_width, handle.image_height))
         self._set_fov()
@@ -252,7 +277,7 @@ class Window:
         seen = self._client.camera
         c2w = np.eye(4)
         c2w[:3, :3] = rotation_matrix(seen.wxyz / np.linalg.norm(seen.wxyz))
-        c2w[:3, 3] = seen.position
+        c2w[:3, 3] = self._viser.to_world(seen.position)
         width, height = max(int(seen.image_width), 1), max(int(seen.image_height), 1)
         focal = height / 2 / math.tan(seen.fov / 2)
         camera = Camera(
