@@ -129,6 +129,8 @@ def _play(arguments: argparse.Namespace) -> int:
     try:
         played = _play_on_a_bar(arguments, target)
     except KeyboardInterrupt:
+        if target.is_picture:
+            raise
         raise KeyboardInterrupt(
             f"the frames that were finished are kept in {target.folder}; --resume goes on"
         ) from None

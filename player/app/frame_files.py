@@ -26,7 +26,6 @@ from player.files.content import content_of
 from player.files.files import check_target
 from player.files.images import open_picture, read_key
 from player.files.replace import clear_up
-from player.render import choose_march
 
 
 @dataclass(frozen=True)
@@ -128,12 +127,11 @@ class Target:
 
 
 def frame_key(asset: Asset, camera: Camera, settings: PlaySettings) -> str:
-    """Return a digest of everything that the picture depends on."""
+    """Return a digest of everything that the picture depends on. The march of `settings` is not "auto"."""
     k = asset.manifest.n_fetches if settings.samples is None else settings.samples
     behind = asset.manifest.background if settings.background is None else settings.background
-    march = choose_march("auto")[0] if settings.march == "auto" else settings.march
     lens = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
-    facts = [camera.c2w.tolist(), lens, k, behind, settings.quality, march]
+    facts = [camera.c2w.tolist(), lens, k, behind, settings.quality, settings.march]
     if asset.n_parts < len(asset.manifest.parts):  # the picture is coarser than one of the whole asset
         facts.append(asset.n_parts)
     return hashlib.sha256(json.dumps([asset.digest, facts]).encode()).hexdigest()

@@ -21,7 +21,8 @@ from player.cameras.camera import Camera
 from player.errors import ConfigError
 from player.files.files import write_bytes
 from player.files.images import MOST_WEBP_SIDE
-from player.render import FRAME_BYTES, MAX_PIXELS, Renderer, check_size, fetches_used
+from player.files.replace import remove
+from player.render import FRAME_BYTES, MAX_PIXELS, Renderer, check_size, choose_march, fetches_used
 
 LARGE_BYTES = 1e9
 """A line warns before a picture is rendered, or a video, that takes this many bytes of memory or more."""
@@ -59,7 +60,8 @@ def play(
     """Render an asset from `cameras` into picture files or a video.
 
     The file of a frame appears when it is complete. After a KeyboardInterrupt, the finished files remain, and
-    the setting `resume` goes on with the others.
+    the setting `resume` goes on with the others. With `force`, the frames that are to be replaced are removed
+    once the first new one is rendered, so that frames of two runs are never mixed.
 
     Args:
         asset: an open asset.
@@ -103,7 +105,9 @@ def play(
     if not settings.dask and settings.march != "numpy":
         from player.proof import prove
 
-        prove(say)  # before the keys, which hold the march
+        prove(say)
+    if settings.march == "auto":  # for keys and for the workers of a cluster, which might choose another
+        settings = replace(settings, march=choose_march("auto")[0])
     keys = [frame_key(asset, camera, settings) for camera in chosen]
     film = video_key(keys, settings.fps)
     if is_complete := settings.resume and target.is_complete(paths, film):
@@ -130,6 +134,9 @@ def play(
     begin = time.perf_counter()
     done: list[Done] = []
     for frame in _rendered(asset, jobs, settings):
+        if settings.force and not done:
+            for path in paths:
+                remove(path)
         write_bytes(paths[missing[frame.index]], frame.data)
         done.append(replace(frame, data=b""))  # the files of a long film would fill the memory
         advance(len(done), len(jobs), frame.milliseconds)

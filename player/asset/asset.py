@@ -138,20 +138,18 @@ class Asset:
         return opening.asset(len(opening.manifest.parts) if parts is None else parts)
 
     @classmethod
-    def growing(
-        cls, folder: str | Path, verify: bool = False, max_memory: float | None = None
-    ) -> Iterator[Asset]:
+    def growing(cls, folder: str | Path, max_memory: float | None = None) -> Iterator[Asset]:
         """Yield the asset in `folder` after each further part is read: first a whole, coarser picture, then
         sharper ones. Each part is read and decoded once.
 
-        Arguments and errors are those of `open`, except that `max_memory` bounds an asset together with the
-        one yielded before it, because the earlier one may still be shown.
+        Arguments and errors are those of `open` without `verify`, except that `max_memory` bounds an asset
+        together with the one yielded before it, because the earlier one may still be shown.
 
         >>> for asset in Asset.growing("out/"):
         ...     print(asset.n_parts, asset.missing)
         1 None
         """
-        opening = _Opening(Path(folder), verify, max_memory)
+        opening = _Opening(Path(folder), False, max_memory)
         n_all = max(len(opening.manifest.parts), 1)
         for n_parts in range(1, n_all):
             asset = opening.asset(n_parts)

@@ -20,6 +20,7 @@ from weakref import WeakSet
 
 import pytest
 
+import player
 from player.app import cli
 from player.app import cluster as cluster_module
 from player.app.cluster import render_on_cluster
@@ -29,6 +30,7 @@ from player.asset.asset import Asset
 from player.cameras.camera import orbit
 from player.cameras.views import asset_cameras
 from player.errors import IntegrityError
+from player.render import choose_march
 from tests.player.conftest import write_shells
 from tests.player.in_parts import write_in_parts
 
@@ -217,6 +219,21 @@ def rendered(asset: Asset, n_frames: int) -> Iterator[Done]:
     return render_on_cluster(
         "tcp://127.0.0.1:1", asset, jobs, PlaySettings(Path("o"), threads=1, march="numpy")
     )
+
+
+def test_workers_march_as_the_key_of_a_frame_says(
+    asset: Asset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The client chooses the march, so that every worker uses the one that the key of a frame names."""
+    marches: list[str] = []
+
+    def on_cluster(address: str, asset: Asset, jobs: list[Job], settings: PlaySettings) -> Iterator[Done]:
+        marches.append(settings.march)
+        return iter(())
+
+    monkeypatch.setattr(cluster_module, "render_on_cluster", on_cluster)
+    player.play(asset, asset_cameras(asset), PlaySettings(tmp_path / "o", dask="tcp://127.0.0.1:1"))
+    assert marches == [choose_march("auto")[0]]
 
 
 def test_workers_need_not_keep_frames_that_have_arrived(asset: Asset, tasks: WeakSet[Task]) -> None:
