@@ -1,6 +1,6 @@
 """Rendering of pictures from an asset and a camera: blocks of pixels are marched and shaded by a few threads.
 
-Each task takes about a hundred 8 x 8 blocks of pixels, marches their rays, and runs the head on the rays that
+Each task takes up to TASK_BLOCKS blocks of 8 x 8 pixels, marches their rays, and runs the head on those that
 hit something. So the march of one task and the head of another run at the same time. The result depends
 neither on the number of threads nor on the size of a task.
 """

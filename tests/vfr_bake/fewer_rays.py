@@ -12,6 +12,7 @@ FEWER = {
     "baking.detail.detail.N_COMPARED": 20_000,
     "baking.detail.detail.N_SEEING": 400_000,
     "baking.held_out.N_LEARNED": 5_000,
+    "baking.plan.FEWEST_RAYS": 25_000,
     "baking.rate.importance.N_RAYS": 40_000,
     "data.witnesses.N_WITNESSES": 15_000,
 }

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from playwright.sync_api import Browser, Page, Route, sync_playwright
 
+from player.page.modules import joined
 from player.page.page import web_files
 
 HERE = Path(__file__).parent
@@ -60,15 +61,16 @@ def stub_loader(cameras: list[dict[str, Any]], fails: str = "") -> str:
     scene = json.dumps({"manifest": manifest, "cameras": cameras, "grid": {}, "problem": None})
     failure = f"throw new Error({json.dumps(fails)});" if fails else ""
     return f"""
-    export async function* loadScene(onProgress) {{
-      onProgress({{ done: 1, total: 2 }});
-      {failure}
-      yield {scene};
-    }}"""
+export async function* loadScene(onProgress) {{
+  onProgress({{ done: 1, total: 2 }});
+  {failure}
+  yield {scene};
+}}"""
 
 
 def page_files(loader: str, poster: bytes = b"") -> dict[str, bytes]:
-    """Return the page's files with the stub renderer and this loader."""
+    """Return the page's files with the stub renderer and this loader; its modules are joined when it is
+    opened, as in an exported page."""
     files = web_files()
     html = files["index.html"]
     parts = {
@@ -127,14 +129,14 @@ def opened(
     context = browser.new_context(**options)
     said: list[str] = []
     missing: list[str] = []
+    script = joined({name: text.decode() for name, text in files.items() if name.endswith(".js")}).encode()
 
     def answer(route: Route) -> None:
         path = route.request.url.removeprefix("http://localhost/scene/").partition("#")[0]
         name = path if "://" in path else path.rpartition("/")[2]  # modules lie in folders
         if name in files:
-            route.fulfill(
-                body=files[name], content_type=TYPES.get(Path(name).suffix, "application/octet-stream")
-            )
+            body = script if name == "main.js" else files[name]
+            route.fulfill(body=body, content_type=TYPES.get(Path(name).suffix, "application/octet-stream"))
         else:
             missing.append(route.request.url)
             route.abort()

@@ -9,6 +9,7 @@ import pytest
 
 from tests.vfr_bake.baking.scenes import trained
 from tests.vfr_bake.fewer_rays import fewer_rays
+from vfr_bake.baking.plan import FEWEST_RAYS
 from vfr_bake.config import FieldOptions, TrainConfig
 from vfr_bake.data import demo
 from vfr_bake.training.model_file import Model
@@ -28,6 +29,12 @@ def few_rays() -> Iterator[None]:
     """Let each bake take a few seconds: these scenes have a hundredth of a real one's pixels."""
     with fewer_rays():
         yield
+
+
+@pytest.fixture
+def planned_rays(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Plan a bake with no fewer rays than a real one has."""
+    monkeypatch.setattr("vfr_bake.baking.plan.FEWEST_RAYS", FEWEST_RAYS)
 
 
 @pytest.fixture(scope="session")  # files of other folders may run between two of this one

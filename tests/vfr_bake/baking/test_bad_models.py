@@ -41,6 +41,7 @@ def test_a_floor_that_no_cell_reaches_is_refused(model: Model, tmp_path: Path) -
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.usefixtures("planned_rays")
 def test_a_grid_becomes_coarser_where_memory_does_not_hold_it(model: Model, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"max_memory: expected at least 0\.82 GB for 48 .* got 0\.8 "):
         bake(model, tmp_path / "asset", BakeConfig(resolution=48, max_memory=0.8), silent)

@@ -207,6 +207,7 @@ def test_a_size_that_cannot_be_met_is_refused_when_the_bake_is_planned(
         make_plan(model, BakeConfig(max_mb=1.02))
 
 
+@pytest.mark.usefixtures("planned_rays")
 @pytest.mark.parametrize(
     ("machine", "memory"),
     [(1 << 29, 0.54), (3 << 29, 0.85), (2 << 30, 1.07), (4 << 30, 2.15), (64 << 30, 4.0)],
@@ -270,6 +271,7 @@ def test_fetches_of_training_rays_are_kept_in_memory_that_cells_and_rays_leave(m
     assert plan.kept_bytes(1e8) == 0
 
 
+@pytest.mark.usefixtures("planned_rays")
 def test_a_small_scene_is_learned_from_fewer_rays(model: Model) -> None:
     plan = make_plan(model, BakeConfig(resolution=48))
     assert [plan.n_rays(n) for n in (1e3, 5e5, 3e6)] == [FEWEST_RAYS, 5e5 * RAYS_OF_CELL, N_RAYS]
