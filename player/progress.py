@@ -38,7 +38,7 @@ class Bar:
         self._title = title
         self._on_terminal = sys.stderr.isatty()
         self._shown = shown and (self._on_terminal or lines)
-        self._begin = time.monotonic()
+        self._begin, self._before = time.monotonic(), 0.0
         self._written = -SECONDS_BETWEEN_BARS if self._on_terminal else self._begin
         self._length = 0
 
@@ -47,6 +47,11 @@ class Bar:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+    def began(self, share: float) -> None:
+        """Say that a share 0..1 of the work is done by now, but that its time says nothing about the rest: an
+        earlier run did it, or code was compiled meanwhile."""
+        self._begin, self._before = time.monotonic(), share
 
     def count(self, done: int, of: int) -> None:
         """Report that `done` of `of` things are done."""
@@ -57,8 +62,8 @@ class Bar:
         if not self._shown:
             return
         now = time.monotonic()
-        elapsed = now - self._begin
-        left = duration(elapsed * (1 - share) / share) if share > 0 else "?"
+        elapsed, done = now - self._begin, share - self._before
+        left = duration(elapsed * (1 - share) / done) if done > 0 else "?"
         if not self._on_terminal:
             if now - self._written > SECONDS_BETWEEN_LINES:
                 self._written = now

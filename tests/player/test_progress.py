@@ -64,6 +64,18 @@ def test_a_bar_that_is_not_wanted(
     assert capsys.readouterr().err == ""
 
 
+def test_what_was_done_before_says_nothing_about_the_time_that_is_left(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(progress, "SECONDS_BETWEEN_LINES", -1.0)
+    clock(monkeypatch, 0.0, 60.0, 60.0, 90.0)
+    with Bar("training") as bar:
+        bar.began(0.5)
+        bar.share(0.5, "first")
+        bar.share(0.75, "second")
+    assert capsys.readouterr().err == "training: 50%, ? left, first\ntraining: 75%, 30 s left, second\n"
+
+
 def test_nothing_to_do_is_done(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(progress, "SECONDS_BETWEEN_LINES", -1.0)
     with Bar("reading") as bar:

@@ -337,6 +337,8 @@ def _train_steps(
             ctrl_c.waits = True  # before the first step is done, there is nothing to keep
             weight = max(0.02, 1 / (n_steps + 1))
             n_steps += 1
+            if n_steps == 1:
+                bar.began(last.progress)
             if last.loss == last.loss:  # a skipped step reports NaN
                 error += weight * (last.loss - error)
                 rays += weight * (last.n_rays - rays)
