@@ -36,9 +36,14 @@ _PLAIN = re.compile(r"torch [A-Za-z0-9]+Storage|torch\._utils _rebuild_tensor_v2
 
 def write_tensors(path: Path, content: dict[str, Any]) -> None:
     """Write `content`, which holds tensors and plain values, to `path`. It goes to the disk piece by piece: a
-    checkpoint has hundreds of megabytes, which would take as much memory again."""
+    checkpoint has hundreds of megabytes, which would take as much memory again. Raises OutputError."""
     with new_file(path) as temporary, temporary.open("xb") as file:
-        torch.save(content, file)
+        try:
+            torch.save(content, file)
+        except RuntimeError as error:  # torch closes its archive, which fails, too, and hides what stopped it
+            if isinstance(error.__context__, OSError | KeyboardInterrupt):
+                raise error.__context__ from None
+            raise
 
 
 def on_cpu(content: Any) -> Any:

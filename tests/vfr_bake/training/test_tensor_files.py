@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import collections
+import errno
+import io
 import pickle
 import tracemalloc
 import zipfile
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 
-from player.errors import ConfigError, FormatError
+from player.errors import ConfigError, FormatError, OutputError
 from vfr_bake.training.tensor_files import read_tensors, write_tensors
 
 
@@ -53,6 +56,33 @@ def test_memory_of_writing(tmp_path: Path) -> None:
     finally:
         tracemalloc.stop()
     assert peak < tensor.nbytes / 10
+
+
+@pytest.mark.parametrize(
+    ("stopped_by", "told"),
+    [
+        (OSError(errno.ENOSPC, "No space left on device"), OutputError),
+        (KeyboardInterrupt(), KeyboardInterrupt),
+    ],
+)
+def test_writing_that_is_stopped_says_by_what(
+    stopped_by: BaseException, told: type[BaseException], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """torch closes its archive when a write fails, which fails, too, with an error that says nothing."""
+
+    class Full(io.FileIO):
+        n_written = 0
+
+        def write(self, data: Any) -> int:
+            if self.n_written > 50_000:
+                raise stopped_by
+            self.n_written += len(data)
+            return super().write(data)
+
+    monkeypatch.setattr(Path, "open", lambda path, mode: Full(path, mode))
+    with pytest.raises(told, match="No space left" if told is OutputError else None):
+        write_tensors(tmp_path / "model.pt", {"a": torch.zeros(100_000)})
+    assert list(tmp_path.iterdir()) == []
 
 
 def twice_in_the_next(inner: list, n_lists: int) -> list:
