@@ -108,9 +108,22 @@ def check_budget(config: BakeConfig, loss: Loss, megabytes: float, ms: float | N
         if limit is not None and got is not None and got > limit:
             error = LossMissedError if name == "loss" else TrainingError
             raise error(
-                f"bake: {name}: expected at most {limit:g} {unit}, got {got:.2f} {unit} ({loss.db:.2f} dB in "
-                f"{megabytes:.1f} MB): nothing was written: allow more, or change the preset"
+                f"bake: {name}: expected at most {limit:g} {unit}, got {_beyond(limit, got)} {unit} "
+                f"({loss.db:.2f} dB in {megabytes:.1f} MB): nothing was written: allow more, or change the "
+                "preset"
             )
+
+
+def _beyond(limit: float, got: float) -> str:
+    """Return a number above a limit with two decimals, or with as many as show that it is above.
+
+    >>> _beyond(11.0, 12.345), _beyond(0.05, 0.0503)
+    ('12.35', '0.0503')
+    """
+    decimals = 2
+    while float(shown := f"{got:.{decimals}f}") <= limit:
+        decimals += 1
+    return shown
 
 
 def frame_ms(asset: Asset, camera: Camera, n_fetches: int) -> float:

@@ -178,13 +178,17 @@ class Plan:
 
 
 def check_bakeable(model: Model, config: BakeConfig) -> None:
-    """Raise ConfigError if the model's field cannot be stored in an asset."""
+    """Raise ConfigError if the model's field cannot be stored in an asset, or not as asked for."""
     field = model.field.config
     for name, needed in (("compositing", "features"), ("activation", "gelu")):
         if getattr(field, name) != needed:
             raise ConfigError(f"model: {name}: expected {needed} to bake, got {getattr(field, name)}")
     if field.unbounded and config.no_cull:
         raise ConfigError("--no-cull: expected the model of an object, got that of an unbounded scene")
+    if config.n_channels is not None and config.n_channels > field.n_channels:
+        raise ConfigError(
+            f"n_channels: expected at most the {field.n_channels} of the model, got {config.n_channels}"
+        )
 
 
 def make_plan(model: Model, config: BakeConfig) -> Plan:

@@ -38,10 +38,19 @@ def bake_command(folder: str, asset: Asset) -> str:
     if not all(value is None or isinstance(value, int | float) for value in chosen.values()):
         return ""
     options = [word for name, value in chosen.items() if value is not None
-               for word in (f"--{name.replace('_', '-')}", f"{value:g}")]  # fmt: skip
+               for word in (f"--{name.replace('_', '-')}", _shown(value))]  # fmt: skip
     if settings.get("no_cull"):
         options.append("--no-cull")
     return command_line("vfr-bake", "model.pt", folder, "--preset", preset, *options)
+
+
+def _shown(value: float) -> str:
+    """Return a number as `vfr-bake` reads it, without a needless point.
+
+    >>> _shown(1_000_000), _shown(50.0), _shown(0.00123456789)
+    ('1000000', '50', '0.00123456789')
+    """
+    return str(value) if isinstance(value, int) else f"{value:.15g}"
 
 
 def play_command(folder: str, samples: int, quality: Quality, size: tuple[int, int]) -> str:

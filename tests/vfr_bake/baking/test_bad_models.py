@@ -41,6 +41,13 @@ def test_a_floor_that_no_cell_reaches_is_refused(model: Model, tmp_path: Path) -
     assert list(tmp_path.iterdir()) == []
 
 
+def test_more_channels_than_the_model_has_are_refused(model: Model, tmp_path: Path) -> None:
+    n = model.field.config.n_channels
+    with pytest.raises(ConfigError, match=f"n_channels: expected at most the {n} of the model, got {n + 1}"):
+        bake(model, tmp_path / "asset", BakeConfig(n_channels=n + 1), silent)
+    assert list(tmp_path.iterdir()) == []
+
+
 @pytest.mark.usefixtures("planned_rays")
 def test_a_grid_becomes_coarser_where_memory_does_not_hold_it(model: Model, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"max_memory: expected at least 0\.82 GB for 48 .* got 0\.8 "):

@@ -20,7 +20,7 @@ import numpy as np
 
 from player.files.images import to_8_bit
 from vfr_bake.data.witnesses import Witnesses
-from vfr_bake.training.scores.metrics import over_background
+from vfr_bake.training.scores.metrics import ROUNDING_ERROR, over_background
 
 PATCH_WEIGHT = 1 / 2
 """Weight of the patches if there are whole views too."""
@@ -157,7 +157,7 @@ def _levels(rgb: np.ndarray) -> np.ndarray:
 
 
 def _decibels(errors: np.ndarray) -> np.ndarray:
-    """Return the dB [...] between mean square errors [..., 2], before and after; an error of 0 counts as
-    1e-12."""
-    least = np.maximum(errors, 1e-12)
+    """Return the dB [...] between mean square errors [..., 2], before and after; an error counts as no less
+    than that of rounding."""
+    least = np.maximum(errors, ROUNDING_ERROR)
     return 10 * np.log10(least[..., 1] / least[..., 0])

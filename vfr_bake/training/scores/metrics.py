@@ -25,6 +25,8 @@ SSIM_WINDOW = 11
 VALUES_AT_ONCE = 3 * 2**20
 """Values, three a pixel, that are compared at once, so that large pictures need little memory."""
 
+ROUNDING_ERROR = 1 / (12 * 255**2)
+"""Mean square error of rounding to 8 bits. Pictures cannot be compared more closely."""
 BRIGHTEST_ERROR = 0.25
 """Difference in [0, 1] from which on the error map is white; fixed, so that views can be compared."""
 

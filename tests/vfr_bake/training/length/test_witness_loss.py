@@ -8,7 +8,15 @@ import numpy as np
 import pytest
 
 from vfr_bake.data.witnesses import Witnesses
-from vfr_bake.training.length.witness_loss import BLOCKS_OF_A_VIEW, PATCH_WEIGHT, T_FACTORS, Loss, WitnessLoss
+from vfr_bake.training.length.witness_loss import (
+    BLOCKS_OF_A_VIEW,
+    PATCH_WEIGHT,
+    T_FACTORS,
+    Loss,
+    WitnessLoss,
+    _decibels,
+)
+from vfr_bake.training.scores.metrics import ROUNDING_ERROR
 
 WHITE = np.ones(3, np.float32)
 
@@ -36,7 +44,8 @@ def written_out(witnesses: Witnesses, before: np.ndarray, after: np.ndarray) -> 
             blocks.setdefault((kind, part), []).append(i)
 
     def lost(rows: list[int]) -> float:
-        first, second = (math.fsum(e[i] for i in rows) / len(rows) for e in (before, after))
+        means = (math.fsum(e[i] for i in rows) / len(rows) for e in (before, after))
+        first, second = (max(mean, ROUNDING_ERROR) for mean in means)
         return 10 * math.log10(second / first)
 
     def loss(left_out: tuple | None) -> float:
@@ -80,7 +89,7 @@ def test_loss_and_spread_are_those_written_out(counts: list[int], whole: list[in
     witnesses = some_witnesses(counts, whole)
     measured = WitnessLoss(witnesses, WHITE)
     random = np.random.default_rng(1)
-    for scale in (1e-9, 0.01, 1.0):
+    for scale in (1e-9, ROUNDING_ERROR, 0.01, 1.0):
         before, after = random.exponential(scale, (2, sum(counts)))
         loss, spread = written_out(witnesses, before, after)
         found = measured.loss(before, after)
@@ -118,6 +127,12 @@ def test_no_change_is_no_loss_and_a_better_picture_loses_less_than_nothing() -> 
     nothing = np.zeros(180)
     assert measured.loss(nothing, nothing) == (0.0, 0.0, 0.0)
     assert math.isfinite(measured.loss(nothing, errors).db)
+
+
+def test_errors_below_that_of_rounding_are_no_loss() -> None:
+    """A model that is exact at all witnesses, as of a scene of one colour, would lose 80 dB by one level."""
+    assert _decibels(np.array([[0.0, 0.0], [0.0, 1e-6]])).tolist() == [0.0, 0.0]
+    assert _decibels(np.array([0.0, 1.0])) == pytest.approx(58.92, abs=0.01)
 
 
 def test_the_spread_is_as_large_as_the_losses_of_other_witnesses_differ() -> None:

@@ -32,7 +32,13 @@ def test_whole_pictures_are_told_apart_from_pixels_of_learned_ones(monkeypatch: 
 def test_pictures_without_any_error_have_a_finite_psnr() -> None:
     """The PSNR of exact pictures, such as those of one colour, is finite: JSON needs a number."""
     found = witness_psnr(np.zeros(4), np.array([False, True, True, False]))
-    assert found == pytest.approx((120.0, 120.0, 120.0))
+    assert found == pytest.approx((58.92, 58.92, 58.92), abs=0.01)
+
+
+def test_patches_that_show_background_alone_say_nothing_of_fog() -> None:
+    found = witness_psnr(np.array([0.0, 0.001]), np.array([False, True]))
+    assert found.patches is not None and found.whole is not None
+    assert found.patches > found.whole + MOST_APART and found.lines() == []
 
 
 def test_there_is_no_warning_without_a_difference_or_without_whole_pictures() -> None:
