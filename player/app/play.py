@@ -21,7 +21,6 @@ from player.cameras.camera import Camera
 from player.errors import ConfigError
 from player.files.files import write_bytes
 from player.files.images import MOST_WEBP_SIDE
-from player.files.replace import remove
 from player.render import FRAME_BYTES, MAX_PIXELS, Renderer, check_size, choose_march, fetches_used
 
 LARGE_BYTES = 1e9
@@ -136,7 +135,8 @@ def play(
     for frame in _rendered(asset, jobs, settings):
         if settings.force and not done:
             for path in paths:
-                remove(path)
+                with suppress(OSError):  # a folder, for example: writing there raises it
+                    path.unlink()
         write_bytes(paths[missing[frame.index]], frame.data)
         done.append(replace(frame, data=b""))  # the files of a long film would fill the memory
         advance(len(done), len(jobs), frame.milliseconds)

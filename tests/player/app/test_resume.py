@@ -20,7 +20,7 @@ from player.app.options import PlaySettings
 from player.app.play import play
 from player.asset.asset import Asset
 from player.cameras.views import asset_cameras
-from player.errors import ConfigError
+from player.errors import ConfigError, OutputError
 from player.files.images import read_key
 from tests.player.app.test_play import decode, trained
 from tests.player.conftest import write_shells
@@ -135,6 +135,15 @@ def test_resume_goes_on_after_frames_were_being_replaced(
         play(asset, cameras, again, advance=interrupted)
     assert [path.name for path in (tmp_path / "o").iterdir()] == ["r_0.png"]
     assert play(asset, cameras, replace(again, force=False, resume=True)).n_kept == 1
+
+
+def test_replacing_frames_removes_no_folder_of_a_frames_name(asset: Asset, tmp_path: Path) -> None:
+    (tmp_path / "r_1.png").mkdir()
+    (tmp_path / "r_1.png" / "mine").touch()
+    cameras = [camera.resized(24, 20) for camera in asset_cameras(asset)[:2]]
+    with pytest.raises(OutputError, match=r"r_1\.png: cannot write"):
+        play(asset, cameras, PlaySettings(tmp_path, force=True, march="numpy"))
+    assert (tmp_path / "r_1.png" / "mine").exists()
 
 
 @pytest.mark.parametrize("name", ["frames", pytest.param("turn.mp4", marks=pytest.mark.extra)])
